@@ -1,0 +1,24 @@
+"""Roll both experiments out in simulation, print one table, write figures and videos.
+
+uv run eval.py
+uv run eval.py --checkpoint=outputs/train/compliance --experiments='[compliance]'
+"""
+
+import sys
+
+import draccus
+
+from hasm_torch.evaluation.evaluate import EvalConfig, evaluate
+
+
+def main() -> None:
+    """Evaluate with the options of the command line."""
+    config = draccus.parse(config_class=EvalConfig)
+    try:
+        evaluate(config)
+    except (FileNotFoundError, ValueError) as error:
+        sys.exit(f"eval.py: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Rollouts in simulation and what is measured of them."""

@@ -1,0 +1,140 @@
+"""One rollout: a human touches, a policy answers, the simulation moves."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+Array = NDArray[np.float64]
+
+
+class Policy(Protocol):
+    """What is rolled out: joint positions and skin in, joint targets out."""
+
+    def reset(self) -> None:
+        """Start a new rollout."""
+
+    def step(self, state: Tensor, skin: Tensor) -> Tensor:
+        """Target of one control step; see ``HASM.step``."""
+
+
+class Human(Protocol):
+    """Whoever touches the robot."""
+
+    def touch(self, time: float, state: Array) -> tuple[str | None, float]:
+        """Patch to press and force, N, from now on; None leaves the skin alone."""
+
+    def finished(self, time: float, state: Array) -> bool:
+        """Whether the rollout is over."""
+
+
+@dataclass
+class Trace:
+    """What happened, one row a control step.
+
+    Attributes:
+        time: (T,) s.
+        state: (T, joints) measured joint positions, rad or m.
+        target: (T, joints) joint targets, rad or m.
+        velocity: (T, joints) measured joint speeds, rad/s or m/s.
+        force: (T,) force that the finger really applied, N.
+        patch: (T,) name of the patch pressed, or None.
+        object_height: (T,) height of the object's lower side above the table, m, or NaN.
+        success: What the environment said at the end.
+        frames: Pictures, if asked for.
+    """
+
+    time: Array
+    state: Array
+    target: Array
+    velocity: Array
+    force: Array
+    patch: list[str | None]
+    object_height: Array
+    success: bool
+    frames: list[NDArray[np.uint8]] = field(default_factory=list)
+
+
+def roll_out(
+    env: Any,
+    policy: Policy,
+    human: Human,
+    joints: Array,
+    seed: int,
+    object_offset: tuple[float, float] = (0.0, 0.0),
+    frame_every: int = 0,
+    watch: Callable[[Policy], None] | None = None,
+) -> Trace:
+    """Roll a policy out.
+
+    Args:
+        env: A ``HSRTouchEnv``.
+        policy: The policy; it is reset first.
+        human: Who touches the robot.
+        joints: (joints,) start positions, rad or m.
+        seed: Seed of the environment.
+        object_offset: How far the object stands from its usual place, m.
+        frame_every: Take a picture every so many steps; 0 takes none.
+        watch: Called with the policy after every step.
+
+    Returns:
+        What happened.
+    """
+    sim = env.unwrapped
+    observation, info = env.reset(seed=seed, options={"joints": joints, "object": object_offset})
+    policy.reset()
+    rows: dict[str, list] = {
+        key: [] for key in ("time", "state", "target", "velocity", "force", "patch", "height")
+    }
+    frames: list[NDArray[np.uint8]] = []
+    success = False
+    time, state = float(info["time"]), np.asarray(observation["state"], dtype=np.float64)
+    while not human.finished(time, state):
+        sim.touch(*human.touch(time, state))
+        target = policy.step(
+            torch.from_numpy(observation["state"]), torch.from_numpy(observation["tactile"])
+        ).numpy()
+        if watch is not None:
+            watch(policy)
+        observation, _, _, truncated, info = env.step(target)
+        time, state = float(info["time"]), np.asarray(observation["state"], dtype=np.float64)
+        success = bool(info["is_success"])
+        values = (time, state, target, np.array(sim.joint_velocity), info["finger_force"])
+        for key, value in zip(rows, (*values, info["touched"], info.get("object_height"))):
+            rows[key].append(value)
+        if frame_every and len(rows["time"]) % frame_every == 0:
+            frames.append(env.render())
+        if truncated:
+            break
+    heights = [np.nan if h is None else h for h in rows["height"]]
+    return Trace(
+        *(np.array(rows[key], dtype=np.float64) for key in ("time", "state", "target")),
+        velocity=np.array(rows["velocity"], dtype=np.float64),
+        force=np.array(rows["force"], dtype=np.float64),
+        patch=rows["patch"],
+        object_height=np.array(heights, dtype=np.float64),
+        success=success,
+        frames=frames,
+    )
+
+
+def limit_violations(
+    trace: Trace, lower: Array, upper: Array, max_speed: Array, tolerance: float = 1e-6
+) -> int:
+    """Number of control steps in which a joint is outside its position or speed limits.
+
+    Args:
+        trace: A rollout.
+        lower: (joints,) lower limits, rad or m.
+        upper: (joints,) upper limits, rad or m.
+        max_speed: (joints,) speed limits, rad/s or m/s.
+        tolerance: Rounding allowed for, rad or m (and per second); float32 readings need it.
+    """
+    outside = (trace.state < lower - tolerance) | (trace.state > upper + tolerance)
+    outside |= (trace.target < lower - tolerance) | (trace.target > upper + tolerance)
+    fast = np.abs(trace.velocity) > max_speed + tolerance
+    return int((outside | fast).any(axis=1).sum())

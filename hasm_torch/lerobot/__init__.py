@@ -1,0 +1,22 @@
+"""Demonstrations in and out: LeRobot v3.0 datasets with synchronised joints and skin.
+
+Inside this package ``import lerobot`` is the installed LeRobot library. Reading needs pyarrow
+only; LeRobot itself is imported where a dataset is written.
+"""
+
+from hasm_torch.lerobot.card import write_card
+from hasm_torch.lerobot.episodes import Episode, EpisodeSet, FeatureMap, load_episodes, windows
+from hasm_torch.lerobot.recording import write_episodes
+from hasm_torch.lerobot.skin import SkinPatch, skin_patches
+
+__all__ = [
+    "Episode",
+    "EpisodeSet",
+    "FeatureMap",
+    "SkinPatch",
+    "load_episodes",
+    "skin_patches",
+    "windows",
+    "write_card",
+    "write_episodes",
+]

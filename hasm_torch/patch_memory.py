@@ -1,0 +1,116 @@
+"""The memory of one skin patch: joint positions in, the next joint positions out.
+
+joints ── PlaceCode ──► s ┐
+ρ ── TactileEmbedding ──► F ── RoPE3D ──► o ┤ HeteroAssociativeMemory ──► successor, pace
+"""
+
+import torch
+from torch import Tensor, nn
+
+from hasm_torch.bipolar import binarise
+from hasm_torch.config import Body, HASMConfig, MemoryShape
+from hasm_torch.memory import HeteroAssociativeMemory
+from hasm_torch.place_code import PlaceCode, place_code
+from hasm_torch.rope3d import touch_rotation
+from hasm_torch.touch import TactileEmbedding
+
+
+class PatchMemory(nn.Module):
+    """Dedicated memory of a patch over the joints that its touch moves.
+
+    A stored successor is (joint positions, pace): the pace is the number of spikes that the
+    episode took to travel the full range of the fastest joint, so that recall at the recorded
+    force repeats the recorded speed.
+
+    Attributes:
+        joints: (J,) indices of the joints that are coded.
+        touch_levels: (L,) stored rate densities ρ; a query is moved to the nearest of them.
+        axis: (3,) rotation axis of the touch.
+        angle: () rotation angle of the touch, rad.
+
+    Args:
+        config: Settings of the method.
+        body: Joints and skin of the robot.
+        patch: Index of the patch.
+        shape: Joints, capacity and number of touch levels.
+    """
+
+    joints: Tensor
+    touch_levels: Tensor
+    axis: Tensor
+    angle: Tensor
+
+    def __init__(self, config: HASMConfig, body: Body, patch: int, shape: MemoryShape) -> None:
+        super().__init__()
+        self.rebinarise = config.rebinarise
+        count = len(shape.joints)
+        self.place_code = PlaceCode(
+            [body.lower[j] for j in shape.joints],
+            [body.upper[j] for j in shape.joints],
+            config.neurons,
+            config.bits,
+            config.width,
+            config.code,
+        )
+        self.embedding = TactileEmbedding(count, config.neurons, config.bits)
+        self.memory = HeteroAssociativeMemory(
+            count * config.neurons * config.bits, count + 1, shape.capacity, storage=config.storage
+        )
+        self.register_buffer("joints", torch.tensor(shape.joints, dtype=torch.int64))
+        self.register_buffer("touch_levels", torch.zeros(shape.touch_levels))
+        axis, angle = touch_rotation(torch.tensor(body.directions[patch], dtype=torch.float32))
+        self.register_buffer("axis", axis)
+        self.register_buffer("angle", angle)
+
+    def codes(self, positions: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
+        """Code joint positions and the touch they were felt with.
+
+        Args:
+            positions: (..., J) positions of the coded joints, rad or m.
+            density: (...,) rate density ρ, 0 to 1.
+
+        Returns:
+            State code s and rotated tactile code o, both (..., D).
+        """
+        if len(self.touch_levels):
+            nearest = (density.unsqueeze(-1) - self.touch_levels).abs().argmin(-1)
+            density = self.touch_levels[nearest]
+        levels = self.place_code.levels(positions)
+        touch = self.embedding(density, levels).to(positions.dtype)
+        rotated = self.memory.rope(touch, self.axis, self.angle)
+        coder = self.place_code
+        state = place_code(levels, coder.bits, coder.code, positions.dtype)
+        return state, binarise(rotated) if self.rebinarise else rotated
+
+    def write(self, positions: Tensor, density: Tensor, successor: Tensor, pace: Tensor) -> None:
+        """Store what follows joint positions under a touch.
+
+        Args:
+            positions: (K, J) positions of the coded joints, rad or m.
+            density: (K,) rate density ρ.
+            successor: (K, J) positions that follow, rad or m.
+            pace: (K,) spikes a full joint range.
+        """
+        state, touch = self.codes(positions, density)
+        self.memory.write(state, touch, torch.cat([successor, pace.unsqueeze(-1)], dim=-1))
+
+    def forward(self, positions: Tensor, density: Tensor) -> tuple[Tensor, Tensor]:
+        """Recall what follows joint positions under a touch.
+
+        Args:
+            positions: (..., J) positions of the coded joints, rad or m.
+            density: (...,) rate density ρ.
+
+        Returns:
+            (..., J) positions that follow; (...,) pace, spikes a full joint range.
+        """
+        decision = self.memory(*self.codes(positions, density))
+        return decision[..., :-1], decision[..., -1]
+
+    def weights(self, positions: Tensor, density: Tensor) -> Tensor:
+        """Softmax weight of every stored association; arguments as in ``forward``.
+
+        Returns:
+            (..., count), summing to 1.
+        """
+        return self.memory.weights(self.memory.associate(*self.codes(positions, density)))

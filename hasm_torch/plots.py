@@ -1,0 +1,146 @@
+"""Figures of an evaluation, drawn with matplotlib."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+PATCH_COLOURS = {
+    "wrist_upper": "tab:orange",
+    "wrist_under": "tab:blue",
+    "wrist_left": "tab:green",
+    "wrist_right": "tab:red",
+}
+
+
+def plot_trajectory(
+    path: Path,
+    time: Array,
+    position: Array,
+    force: Array,
+    speed: Array,
+    patches: list[str | None],
+    joint: str,
+) -> None:
+    """Joint trajectory, force and joint speed over time, the touched patches shaded.
+
+    Args:
+        path: PNG to write.
+        time: (T,) s.
+        position: (T,) rad.
+        force: (T,) N.
+        speed: (T,) rad/s.
+        patches: (T,) patch touched, or None.
+        joint: Name of the joint.
+    """
+    figure, axes = plt.subplots(3, 1, sharex=True, figsize=(9, 6.5))
+    for axis, values, label in zip(
+        axes,
+        (position, force, speed),
+        (f"{joint}\nposition (rad)", "force on the skin\n(N)", "joint speed\n(rad/s)"),
+    ):
+        _shade(axis, time, patches)
+        axis.plot(time, values, color="black", linewidth=1.2)
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    axes[-1].set_xlabel("time (s)")
+    handles, labels = axes[0].get_legend_handles_labels()
+    named = dict(zip(labels, handles))
+    axes[0].legend(named.values(), named.keys(), loc="best", title="touched patch")
+    axes[0].set_title("Pseudo-compliance: the joint yields to the touch, faster the harder it is")
+    _save(figure, path)
+
+
+def plot_force_speed(path: Path, behaviours: dict[str, dict[str, Any]]) -> None:
+    """Force against mean joint speed with a straight line through them, a panel a behaviour.
+
+    Args:
+        path: PNG to write.
+        behaviours: As in ``metrics.json``.
+    """
+    figure, axes = plt.subplots(1, len(behaviours), figsize=(3.4 * len(behaviours), 3.4))
+    for axis, (name, figures) in zip(np.atleast_1d(axes), behaviours.items()):
+        points = np.array(figures["velocities"]).reshape(-1, 2)
+        axis.scatter(points[:, 0], points[:, 1], s=14, color="tab:blue")
+        if len(points) > 1 and np.ptp(points[:, 0]) > 0:
+            slope, offset = np.polyfit(points[:, 0], points[:, 1], 1)
+            ends = np.array([points[:, 0].min(), points[:, 0].max()])
+            axis.plot(ends, slope * ends + offset, color="black", linewidth=1)
+        axis.set_title(
+            f"{name}\nR² {figures['r2']:.3f}, rank correlation {figures['spearman']:.3f}",
+            fontsize=9,
+        )
+        axis.set_xlabel("force (N)")
+        axis.grid(alpha=0.3)
+    np.atleast_1d(axes)[0].set_ylabel("mean joint speed (rad/s)")
+    _save(figure, path)
+
+
+def plot_recall(
+    path: Path,
+    time: Array,
+    weights: list[tuple[str, Array] | None],
+    names: list[str],
+) -> None:
+    """Recall weights over the stored sequences through a rollout, a panel a memory.
+
+    Args:
+        path: PNG to write.
+        time: (T,) s.
+        weights: (T,) patch and softmax weight of each of its associations, or None without touch.
+        names: Patches to draw.
+    """
+    figure, axes = plt.subplots(len(names), 1, sharex=True, figsize=(9, 2.8 * len(names)))
+    for axis, name in zip(np.atleast_1d(axes), names):
+        found = [(t, w[1]) for t, w in zip(time, weights) if w is not None and w[0] == name]
+        if found:
+            count = len(found[0][1])
+            image = np.full((count, len(time)), np.nan)
+            for t, column in found:
+                image[:, int(np.searchsorted(time, t))] = column
+            shown = axis.imshow(
+                image,
+                aspect="auto",
+                origin="lower",
+                interpolation="nearest",
+                extent=(time[0], time[-1], 0, count),
+                cmap="viridis",
+                vmin=0,
+                vmax=1,
+            )
+            figure.colorbar(shown, ax=axis, label="softmax weight")
+        axis.set_ylabel(f"{name}\nstored association")
+    np.atleast_1d(axes)[-1].set_xlabel("time (s); blank where the patch is not touched")
+    np.atleast_1d(axes)[0].set_title("Recall weights through a grasp")
+    _save(figure, path)
+
+
+def _shade(axis: Any, time: Array, patches: list[str | None]) -> None:
+    start = 0
+    for i in range(1, len(patches) + 1):
+        if i == len(patches) or patches[i] != patches[start]:
+            patch = patches[start]
+            if patch is not None:
+                axis.axvspan(
+                    time[start],
+                    time[min(i, len(time) - 1)],
+                    color=PATCH_COLOURS.get(patch, "grey"),
+                    alpha=0.2,
+                    label=patch,
+                    linewidth=0,
+                )
+            start = i
+
+
+def _save(figure: Any, path: Path) -> None:
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)

@@ -1,0 +1,227 @@
+"""Softmax recall over a memory of ±1 codes, one bit an entry.
+
+Layout: a block holds 64 associations; ``words[block, w, row]`` is word w (32 entries, the first in the
+lowest bit) of association 64·block + row. Entries past the code and rows past the memory are zero.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from hasm_torch.recall.dense import Recall, check_shapes, exclude, summarise
+
+ROWS = 64  # associations in a block
+WORD = 32  # entries in a word
+_PACKED_AT_ONCE = 1 << 24  # entries
+
+
+def pack(codes: Tensor) -> Tensor:
+    """Packs codes by sign, one bit an entry (x >= 0 becomes 1).
+
+    Args:
+        codes: (..., rows, dim).
+
+    Returns:
+        (..., blocks, words, 64) int32 with blocks = ⌈rows / 64⌉ and words = ⌈dim / 32⌉.
+    """
+    rows, dim = codes.shape[-2:]
+    blocks, words = -(-rows // ROWS), -(-dim // WORD)
+    bits = torch.nn.functional.pad(codes >= 0, (0, words * WORD - dim, 0, blocks * ROWS - rows))
+    shifts = torch.arange(WORD, dtype=torch.int32, device=codes.device)
+    parts = [
+        (part.unflatten(-1, (words, WORD)).to(torch.int32) << shifts).sum(-1, dtype=torch.int32)
+        for part in bits.split(max(1, _PACKED_AT_ONCE // (words * WORD)), dim=-2)
+    ]
+    return torch.cat(parts, dim=-2).unflatten(-2, (blocks, ROWS)).mT.contiguous()
+
+
+def unpack(words: Tensor, dim: int) -> Tensor:
+    """The codes of a packed memory.
+
+    Args:
+        words: (..., blocks, words, 64) int32.
+        dim: Entries of a code.
+
+    Returns:
+        (..., 64 * blocks, dim) in {-1, +1}, float32; rows never stored are -1.
+    """
+    shifts = torch.arange(WORD, dtype=torch.int32, device=words.device)
+    bits = (words.mT.unsqueeze(-1) >> shifts) & 1
+    return bits.flatten(-2)[..., :dim].flatten(-3, -2) * 2.0 - 1.0
+
+
+def store(words: Tensor, rows: Tensor, codes: Tensor) -> None:
+    """Writes codes into rows of a packed memory, in place.
+
+    Args:
+        words: (blocks, words, 64) int32.
+        rows: (n,) int64.
+        codes: (n, dim); the sign counts.
+    """
+    packed = pack(codes).mT.flatten(0, 1)[: len(rows)]
+    words[rows // ROWS, :, rows % ROWS] = packed
+
+
+def recall_packed(
+    query: Tensor,
+    words: Tensor,
+    successors: Tensor,
+    beta: float | Tensor,
+    count: Tensor | None = None,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """Recalls what followed the associations most like the query, from a packed memory.
+
+        d = S₋₁ softmax(β Mᵀ q),   mᵀq = dim - 2·popcount(m xor q)
+
+    Exact for ±1 codes and every β: what is left out weighs less than 2⁻⁴⁰ of the whole, which moves
+    the decision by less than 2⁻³⁹ of the largest successor. The query is binarised by sign, so no
+    gradient reaches it; gradients reach β and the successors.
+
+    Args:
+        query: q, (*batch, ..., dim), finite; the sign counts.
+        words: M as ``pack`` gives it, (*batch, blocks, words, 64) int32: one memory for all queries
+            without ``batch``, else a memory for each of its entries.
+        successors: S₋₁, (*batch, rows, values) with rows <= 64 * blocks, float32.
+        beta: β, a number or a () tensor.
+        count: Number of rows filled, () or (*batch,) int64; without it all rows.
+        mask: Rows each query may recall, (*batch, ..., rows) bool.
+
+    Returns:
+        Decision d, (*batch, ..., values); NaN where no row takes part.
+
+    Raises:
+        ValueError: If the shapes do not fit one another, or β is not a number.
+    """
+    return _recall(query, words, successors, beta, count, mask)[0]
+
+
+def inspect_packed(
+    query: Tensor,
+    words: Tensor,
+    successors: Tensor,
+    beta: float | Tensor,
+    count: Tensor | None = None,
+    mask: Tensor | None = None,
+) -> Recall:
+    """Recalls like ``recall_packed`` and tells the best match, its margin and the entropy."""
+    decision, index, certainty = _recall(query, words, successors, beta, count, mask)
+    return Recall(decision, index, *certainty.unbind(0))
+
+
+def _recall(
+    query: Tensor,
+    words: Tensor,
+    successors: Tensor,
+    beta: float | Tensor,
+    count: Tensor | None,
+    mask: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Decision, index, and (score, margin, entropy) stacked: by the operator or, for gradients, torch."""
+    batch, (blocks, width) = words.shape[:-3], words.shape[-3:-1]
+    rows = successors.shape[-2]
+    check_shapes(query, batch, blocks * ROWS, successors, mask)
+    if width != -(-query.shape[-1] // WORD):
+        raise ValueError(
+            f"expected a query of {WORD * width - WORD + 1} to {WORD * width} entries for "
+            f"{width} words a code, got {query.shape[-1]}"
+        )
+    beta = torch.as_tensor(beta, dtype=torch.float64 if isinstance(beta, float) else None)
+    if count is None:
+        count = torch.full((), rows, dtype=torch.int64, device=query.device)
+    learning = torch.is_grad_enabled() and (beta.requires_grad or successors.requires_grad)
+    if learning or successors.dtype != torch.float32:
+        return _recall_by_torch(query, words, successors, beta, count, mask)
+    return _packed_recall(query.detach(), words, successors, beta, count, mask)
+
+
+def _recall_by_torch(
+    query: Tensor,
+    words: Tensor,
+    successors: Tensor,
+    beta: Tensor,
+    count: Tensor,
+    mask: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The same recall in torch operations: any device, and gradients for β and the successors."""
+    batch_dims, dim, rows = words.ndim - 3, query.shape[-1], successors.shape[-2]
+    signs = pack(query.reshape(*words.shape[:-3], -1, dim))  # (*batch, blocks_q, width, 64)
+    signs = signs.mT.flatten(-3, -2)[..., : query[..., 0].numel() // max(1, words[..., 0, 0, 0].numel()), :]
+    stored = words.transpose(-3, -2).flatten(-2)  # (*batch, width, 64 * blocks)
+    distances = torch.zeros(
+        *signs.shape[:-1], stored.shape[-1], dtype=torch.int32, device=query.device
+    )
+    for word in range(words.shape[-2]):
+        differing = signs[..., :, word].unsqueeze(-1) ^ stored[..., word, :].unsqueeze(-2)
+        distances += _count_ones(differing)
+    scores = (dim - 2 * distances)[..., :rows].reshape(*query.shape[:-1], rows)
+    scores = scores.to(torch.promote_types(successors.dtype, torch.float32))
+    logits = (beta * scores).masked_fill(exclude(scores, batch_dims, count, mask), -torch.inf)
+    recall = summarise(scores, logits, beta, query, successors)
+    return recall.decision, recall.index, torch.stack(recall[2:])
+
+
+def _count_ones(bits: Tensor) -> Tensor:
+    """Number of ones in every int32, by adding neighbours: pairs, nibbles, bytes."""
+    bits = bits - ((bits >> 1) & 0x55555555)
+    bits = (bits & 0x33333333) + ((bits >> 2) & 0x33333333)
+    bits = (bits + (bits >> 4)) & 0x0F0F0F0F
+    return (bits * 0x01010101) >> 24
+
+
+_library = torch.library.Library("hasm_torch", "FRAGMENT")
+_library.define(
+    "packed_recall(Tensor query, Tensor words, Tensor successors, Tensor beta, Tensor count, "
+    "Tensor? mask) -> (Tensor decision, Tensor index, Tensor certainty)",
+    tags=(torch.Tag.pt2_compliant_tag,),
+)
+_packed_recall = torch.ops.hasm_torch.packed_recall.default
+
+
+def _on_cpu(
+    query: Tensor,
+    words: Tensor,
+    successors: Tensor,
+    beta: Tensor,
+    count: Tensor,
+    mask: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    from hasm_torch.recall.packed_cpu import scan_cpu
+
+    value = beta.item()
+    if math.isnan(value):
+        raise ValueError("expected beta to be a number, got NaN")
+    if query.dtype != torch.float32:
+        query = torch.where(query >= 0, 1.0, -1.0)
+    if count.shape != words.shape[:-3]:
+        count = count.expand(words.shape[:-3])
+    return scan_cpu(
+        query.contiguous(),
+        words.contiguous(),
+        successors.contiguous(),
+        value,
+        count.contiguous(),
+        None if mask is None else mask.contiguous(),
+    )
+
+
+def _shapes_only(
+    query: Tensor,
+    words: Tensor,
+    successors: Tensor,
+    beta: Tensor,
+    count: Tensor,
+    mask: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    leading, values = query.shape[:-1], successors.shape[-1]
+    return (
+        successors.new_empty(*leading, values),
+        count.new_empty(leading),
+        successors.new_empty(3, *leading),
+    )
+
+
+_library.impl("packed_recall", _on_cpu, "CPU")
+_library.impl("packed_recall", _recall_by_torch, "CompositeExplicitAutograd")
+torch.library.register_fake("hasm_torch::packed_recall", _shapes_only, lib=_library)

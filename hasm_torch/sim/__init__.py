@@ -1,0 +1,13 @@
+"""Simulation of the touched HSR: importing this registers "hasm_torch/HSRTouch-v0"."""
+
+import gymnasium as gym
+
+from hasm_torch.sim.env import MAX_EPISODE_STEPS, HSRTouchEnv
+
+__all__ = ["HSRTouchEnv"]
+
+gym.register(
+    id="hasm_torch/HSRTouch-v0",
+    entry_point="hasm_torch.sim.env:HSRTouchEnv",
+    max_episode_steps=MAX_EPISODE_STEPS,
+)

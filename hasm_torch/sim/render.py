@@ -1,0 +1,165 @@
+"""Pictures of a scene: the robot, the skin cells coloured by their force, the human finger."""
+
+import importlib
+import os
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from hasm_torch.robot import Skin
+from hasm_torch.sim.scene import FINGER_RADIUS
+
+Array = NDArray[np.float64]
+
+HEIGHT, WIDTH = 480, 640
+
+_HOVER = 0.03  # m, gap at which a finger that does not touch is drawn
+_FULL_COLOUR = 4.0  # N in one cell
+_SKIN_COLOUR = np.array([0.93, 0.72, 0.6, 1.0])
+_SLEEVE_COLOUR = np.array([0.25, 0.35, 0.6, 1.0])
+# Colours of a cell from no force to `_FULL_COLOUR`.
+_CELL_COLOURS = np.array(
+    [[0.13, 0.3, 0.24], [0.95, 0.85, 0.1], [1.0, 0.45, 0.05], [0.95, 0.1, 0.05]]
+)
+_CAMERAS = {
+    "compliance": ((0.26, 0.0, 0.72), 1.3, 126.0, -16.0),
+    "grasp": ((0.36, 0.0, 0.74), 1.3, 126.0, -18.0),
+}
+
+
+class SceneRenderer:
+    """Draws a simulation from a fixed camera, without shadows.
+
+    Args:
+        model: Model of the scene.
+        skin: Geometry of the cells.
+        scene: "compliance" or "grasp": where the camera stands.
+
+    Raises:
+        RuntimeError: No OpenGL context can be made.
+    """
+
+    # A second attempt after a failed one can end the process, so the first answer stands.
+    _failure: ClassVar[str | None] = None
+
+    def __init__(self, model: mujoco.MjModel, skin: Skin, scene: str) -> None:
+        if SceneRenderer._failure is not None:
+            raise RuntimeError(SceneRenderer._failure)
+        try:
+            _choose_backend()
+            self._renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+        # MuJoCo's backends fail with errors of many kinds: a missing library, device or display.
+        except Exception as error:
+            SceneRenderer._failure = (
+                "cannot draw the scene: no OpenGL context could be made. Without a display install "
+                "libEGL (Debian package libegl1) or set MUJOCO_GL=osmesa and install libOSMesa "
+                "(libosmesa6), or make the environment with render_mode=None "
+                f"({type(error).__name__}: {error})"
+            )
+            raise RuntimeError(SceneRenderer._failure) from error
+        self._scene_options = mujoco.MjvOption()
+        self._camera = mujoco.MjvCamera()
+        view = _CAMERAS[scene]
+        self._camera.lookat[:] = view[0]
+        self._camera.distance, self._camera.azimuth, self._camera.elevation = view[1:]
+        self._finger = model.body("finger").id
+        self._hexagon = model.mesh("cell").id
+        # The compiler turns a mesh onto its principal axes; drawing turns it back.
+        turned_back = np.zeros(9)
+        mujoco.mju_quat2Mat(turned_back, model.mesh_quat[self._hexagon])
+        self._patches = []
+        positions, normals = skin.positions.numpy(), skin.normals.numpy()
+        self._centres: dict[str, tuple[int, Array, Array]] = {}
+        for name in skin.patches:
+            span, body = skin.slices[name], model.body(skin.link[name]).id
+            rotation = _cell_rotation(normals[span][0], skin.points.numpy()[span][0])
+            rotation = rotation @ turned_back.reshape(3, 3)
+            self._patches.append((span, body, positions[span], rotation))
+            self._centres[name] = (body, positions[span].mean(0), normals[span][0])
+
+    def render(self, data: mujoco.MjData, forces: Array, patch: str | None) -> NDArray[np.uint8]:
+        """Draws the scene.
+
+        Args:
+            data: Simulation, with up-to-date kinematics.
+            forces: (cells, 3) skin forces, N.
+            patch: Patch that the finger is at, or None.
+
+        Returns:
+            (480, 640, 3) image.
+        """
+        self._renderer.update_scene(data, self._camera, self._scene_options)
+        scene = self._renderer.scene
+        scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        colours = _colours(forces.sum(1))
+        for span, body, positions, rotation in self._patches:
+            frame = data.xmat[body].reshape(3, 3)
+            world = data.xpos[body] + positions @ frame.T
+            turned = (frame @ rotation).ravel()
+            for position, colour in zip(world, colours[span], strict=True):
+                geom = _add(scene, mujoco.mjtGeom.mjGEOM_MESH, np.ones(3), position, turned, colour)
+                geom.dataid = 2 * self._hexagon
+        if patch is not None:
+            self._draw_finger(data, scene, patch)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Frees the OpenGL context."""
+        self._renderer.close()
+
+    def _draw_finger(self, data: mujoco.MjData, scene: mujoco.MjvScene, patch: str) -> None:
+        body, centre, normal = self._centres[patch]
+        frame = data.xmat[body].reshape(3, 3)
+        outward = frame @ normal
+        tip = data.xpos[self._finger].copy()
+        if tip[2] < 0:
+            tip = data.xpos[body] + frame @ centre + outward * (FINGER_RADIUS + _HOVER)
+        knuckle, wrist = tip + outward * 0.07, tip + outward * 0.13
+        eye, flat = np.eye(3).ravel(), np.zeros(3)
+        sphere = np.full(3, FINGER_RADIUS)
+        _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, sphere, tip, eye, _SKIN_COLOUR)
+        for start, end, radius, colour in (
+            (tip, knuckle, FINGER_RADIUS, _SKIN_COLOUR),
+            (knuckle, wrist, 0.02, _SLEEVE_COLOUR),
+        ):
+            geom = _add(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, flat, start, eye, colour)
+            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, radius, start, end)
+
+
+def _choose_backend() -> None:
+    """Draws by the backend of MUJOCO_GL, even if mujoco was imported before that was set."""
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    used = importlib.import_module("mujoco.rendering.classic.gl_context")
+    if chosen in ("egl", "osmesa") and f"mujoco.{chosen}" != used.GLContext.__module__:
+        importlib.reload(used)
+
+
+def _cell_rotation(normal: Array, points: Array) -> Array:
+    """Axes of a cell as columns: a flat side of the hexagon faces the first force point."""
+    along = points[0] - points.mean(0)
+    along /= np.linalg.norm(along)
+    return np.column_stack([along, np.cross(normal, along), normal])
+
+
+def _colours(forces: Array) -> Array:
+    """(cells,) forces, N, to (cells, 4) colours."""
+    place = np.clip(forces / _FULL_COLOUR, 0, 1) * (len(_CELL_COLOURS) - 1)
+    levels = np.arange(len(_CELL_COLOURS))
+    channels = [np.interp(place, levels, _CELL_COLOURS[:, c]) for c in range(3)]
+    return np.column_stack([*channels, np.ones(len(forces))])
+
+
+def _add(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    size: Array,
+    position: Array,
+    rotation: Array,
+    colour: Array,
+) -> mujoco.MjvGeom:
+    geom = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, kind, size, position, rotation, colour.astype(np.float32))
+    scene.ngeom += 1
+    return geom

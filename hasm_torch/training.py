@@ -1,0 +1,114 @@
+"""From a dataset to a trained model."""
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from hasm_torch.config import HASMConfig
+from hasm_torch.hasm import HASM
+from hasm_torch.learning import FitReport
+
+METHODS = ("default", "literal")
+
+
+@dataclass
+class DatasetConfig:
+    """Which dataset to learn from.
+
+    Attributes:
+        root: Folder of the LeRobot v3.0 dataset.
+    """
+
+    root: Path | None = None
+
+
+@dataclass
+class TrainConfig:
+    """Options of ``train.py``.
+
+    Attributes:
+        dataset: Which dataset to learn from.
+        output_dir: Where the checkpoint goes.
+        method: "default", with the settings under ``model``, or "literal", the paper as written.
+        model: Settings of the method.
+    """
+
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    output_dir: Path | None = None
+    method: Literal["default", "literal"] = "default"
+    model: HASMConfig = field(default_factory=HASMConfig)
+
+
+@dataclass
+class Trained:
+    """A trained model.
+
+    Attributes:
+        model: The model.
+        report: What it stored.
+        seconds: Time from the files to the model, s; the libraries' import is not in it.
+    """
+
+    model: HASM
+    report: FitReport
+    seconds: float
+
+
+def settings(method: str, model: HASMConfig) -> HASMConfig:
+    """The settings of a named method.
+
+    Raises:
+        ValueError: If the method is unknown, or "literal" meets settings that differ from the
+            defaults and would be lost.
+    """
+    if method not in METHODS:
+        raise ValueError(f"unknown method {method!r}, valid: {', '.join(METHODS)}")
+    if method == "default":
+        return model
+    if model != HASMConfig():
+        raise ValueError(
+            "--method=literal fixes every setting of the model: leave the --model options out, "
+            "or give them all with --method=default"
+        )
+    return HASMConfig.literal()
+
+
+def train(root: Path, config: HASMConfig) -> Trained:
+    """Learn a dataset.
+
+    Args:
+        root: Folder of the dataset.
+        config: Settings of the method.
+
+    Returns:
+        The model and what it took.
+
+    Raises:
+        FileNotFoundError: If there is no dataset.
+        ValueError: If the dataset is damaged or lacks what the method needs.
+    """
+    import pyarrow.parquet  # noqa: F401  # so that its import is not timed
+
+    from hasm_torch.lerobot.body import body_of
+    from hasm_torch.lerobot.episodes import load_episodes
+
+    begin = time.perf_counter()
+    data = load_episodes(root)
+    model = HASM(config, body_of(data))
+    report = model.fit(data)
+    return Trained(model, report, time.perf_counter() - begin)
+
+
+def describe(trained: Trained) -> str:
+    """What was stored, as a table for people."""
+    lines = [f"{'patch':<14}{'associations':>14}{'beta':>8}  joints"]
+    for patch, count in trained.report.associations.items():
+        beta = trained.report.betas[patch]
+        joints = ", ".join(j.removesuffix("_joint") for j in trained.report.joints[patch])
+        lines.append(f"{patch:<14}{count:>14}{beta:>8.2f}  {joints}")
+    size = trained.model.memory_bytes() / 1e3
+    lines.append(
+        f"{trained.report.episodes} episodes stored in {trained.seconds:.2f} s, {size:.0f} kB"
+    )
+    return "\n".join(lines)
