@@ -6,17 +6,16 @@ uv run eval.py --checkpoint=outputs/train/compliance --experiments='[compliance]
 
 import sys
 
-import draccus
-
+from hasm_torch.command_line import parse_options
 from hasm_torch.evaluation.evaluate import EvalConfig, evaluate
 
 
 def main() -> None:
     """Evaluate with the options of the command line."""
-    config = draccus.parse(config_class=EvalConfig)
+    config = parse_options(EvalConfig)
     try:
         evaluate(config)
-    except (FileNotFoundError, ValueError) as error:
+    except (OSError, ValueError) as error:
         sys.exit(f"eval.py: {error}")
 
 

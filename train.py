@@ -5,14 +5,13 @@ uv run train.py --dataset.root=datasets/hsr_compliance --output_dir=outputs/trai
 
 import sys
 
-import draccus
-
+from hasm_torch.command_line import parse_options
 from hasm_torch.training import TrainConfig, describe, settings, train
 
 
 def main() -> None:
     """Train with the options of the command line."""
-    config = draccus.parse(config_class=TrainConfig)
+    config = parse_options(TrainConfig)
     if config.dataset.root is None or config.output_dir is None:
         sys.exit(
             "train.py needs a dataset and a place for the checkpoint, for example "
@@ -20,9 +19,9 @@ def main() -> None:
         )
     try:
         trained = train(config.dataset.root, settings(config.method, config.model))
-    except (FileNotFoundError, ValueError) as error:
+        trained.model.save_pretrained(config.output_dir)
+    except (OSError, ValueError) as error:
         sys.exit(f"train.py: {error}")
-    trained.model.save_pretrained(config.output_dir)
     print(describe(trained))
     print(f"checkpoint: {config.output_dir}")
 

@@ -3,7 +3,7 @@
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 
 @dataclass
@@ -18,6 +18,7 @@ class Body:
         patches: Names of the skin patches.
         cells: Number of cells of each patch; patches follow each other in the tactile vector.
         directions: Outward normal of each patch in the frame of the link that carries it.
+        links: Name of the link that carries each patch; needed for the base frame only.
         rate: Control and sampling rate, Hz.
     """
 
@@ -28,6 +29,7 @@ class Body:
     patches: list[str] = field(default_factory=list)
     cells: list[int] = field(default_factory=list)
     directions: list[list[float]] = field(default_factory=list)
+    links: list[str] = field(default_factory=list)
     rate: float = 50.0
 
     def __post_init__(self) -> None:
@@ -83,6 +85,9 @@ class HASMConfig:
             others where they are; "all" codes and commands every joint.
         touch_levels: "nearest" stores one rate density an episode and recalls at the nearest
             stored one; "exact" uses the rate density of each sample as it is.
+        frame: Frame in which the direction of a touch rotates its code: "link", of the link that
+            carries the patch, where it is the same in every posture; "base", of the robot's base,
+            where it keeps its meaning in space (the bundled HSR's joints only).
         rebinarise: Whether rotated codes return to ±1 by sign before they are bound.
         storage: How associations are held, see ``HeteroAssociativeMemory``.
         beta: Inverse temperature; None derives it from the margin of the stored memory.
@@ -106,9 +111,21 @@ class HASMConfig:
     advance: Literal["spike", "tick"] = "spike"
     code_joints: Literal["moved", "all"] = "moved"
     touch_levels: Literal["nearest", "exact"] = "nearest"
+    frame: Literal["link", "base"] = "link"
     rebinarise: bool = True
     storage: Literal["float32", "bfloat16", "int8", "bit"] = "bit"
     beta: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, kind in get_type_hints(type(self)).items():
+            valid = get_args(kind)
+            if get_origin(kind) is Literal and getattr(self, name) not in valid:
+                raise ValueError(
+                    f"unknown {name} {getattr(self, name)!r}, valid: {', '.join(valid)}"
+                )
+        for name in ("current_per_newton", "max_rate", "rate_window_s", "pair_window_s"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
 
     @classmethod
     def literal(cls) -> "HASMConfig":

@@ -5,12 +5,14 @@ it along the straight segment to the recalled successor by 1/pace of a joint ran
 successor the next one is recalled. Without spikes nothing moves, so the robot holds still.
 """
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from hasm_torch.patch_memory import PatchMemory
+from hasm_torch.skin_encoder import SkinState
 
 # A walk that needs more recalls than this in one control step waits for the next one, which
 # bounds the time a step takes.
@@ -48,8 +50,33 @@ class Walk:
     quiet: dict[str, int] = field(default_factory=dict)
 
 
+@dataclass
+class Rollout:
+    """What one robot's control loop needs to go on; several robots can share the memories.
+
+    Attributes:
+        spikes: Spikes of every patch in the last control steps, (patches,) each.
+        density: (patches,) rate density ρ of every patch at the last step.
+        touched: Patches with a memory that spiked in the last step.
+        skin: State of the skin's encoder.
+        walk: Where the robot is in the memories.
+    """
+
+    spikes: deque[Tensor]
+    density: Tensor
+    touched: list[str] = field(default_factory=list)
+    skin: SkinState | None = None
+    walk: Walk = field(default_factory=Walk)
+
+
 def advance(
-    reference: Tensor, walk: Walk, patch: str, memory: PatchMemory, spikes: float, density: Tensor
+    reference: Tensor,
+    walk: Walk,
+    patch: str,
+    memory: PatchMemory,
+    spikes: float,
+    density: Tensor,
+    link: Tensor | None = None,
 ) -> Tensor:
     """Move the reference by a number of spikes of one patch.
 
@@ -60,6 +87,7 @@ def advance(
         memory: The patch's memory.
         spikes: Spikes to spend.
         density: () rate density ρ of the patch.
+        link: (3, 3) rotation of the patch's link, see ``PatchMemory.codes``.
 
     Returns:
         (joints,) the moved reference; joints that the memory does not code stay.
@@ -69,7 +97,7 @@ def advance(
     for _ in range(RECALLS_A_STEP):
         goal = walk.goals.get(patch)
         if goal is None:
-            positions, pace = memory(coded, density)
+            positions, pace = memory(coded, density, link)
             goal = walk.goals[patch] = Goal(positions, float(pace))
         way = goal.positions - coded
         needed = goal.pace * float((way / span).abs().max())

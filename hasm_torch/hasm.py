@@ -5,22 +5,23 @@ skin forces ──EffectiveForce──Izhikevich──► ρ ──TactileEmbedd
                                     m = s ⊗ o ──HeteroAssociativeMemory──► joint targets
 """
 
-import json
 from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
-from hasm_torch.config import Body, HASMConfig, MemoryShape, as_dict, write_json
-from hasm_torch.control import Walk, advance, limit_speed
+from hasm_torch import checkpoint
+from hasm_torch.config import Body, HASMConfig, MemoryShape
+from hasm_torch.control import Rollout, Walk, advance, limit_speed
 from hasm_torch.learning import FitReport, Recording, learn
 from hasm_torch.patch_memory import PatchMemory
-from hasm_torch.skin_encoder import SkinEncoder, SkinState
+from hasm_torch.skin_encoder import SkinEncoder
 
-CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
+if TYPE_CHECKING:
+    from hasm_torch.robot import Kinematics
 
 # A patch that was quiet this long is touched anew, s.
 ONSET_AFTER = 0.2
@@ -34,8 +35,7 @@ class HASM(nn.Module):
 
     Attributes:
         memories: The patches that have learned something, by name.
-        touched: Patches with a memory that spiked in the last step.
-        density: (patches,) rate density ρ of every patch at the last step.
+        rollout: The control loop that ``step`` goes on with unless it is given another.
         tolerance: (joints,) how far a joint may be from its reference before the reference waits
             or, at a new touch, follows the joint, rad or m.
 
@@ -55,6 +55,7 @@ class HASM(nn.Module):
     ) -> None:
         super().__init__()
         self.config, self.body = config, body
+        self._kinematics: "Kinematics | None" = None
         self.skin = SkinEncoder(
             body.cells,
             body.rate,
@@ -82,6 +83,40 @@ class HASM(nn.Module):
         self.shapes[patch], self.memories[patch] = shape, memory
         return memory
 
+    def memory(self, patch: str) -> PatchMemory:
+        """The memory of a patch that has learned something."""
+        memory = self.memories[patch]
+        assert isinstance(memory, PatchMemory)
+        return memory
+
+    def link_rotation(self, patch: str, positions: Tensor) -> Tensor | None:
+        """Rotation of a patch's link in the base frame, by forward kinematics.
+
+        Args:
+            patch: Name of the patch.
+            positions: (..., joints) joint positions, rad or m.
+
+        Returns:
+            (..., 3, 3), or None where touches are told apart in the link's own frame.
+
+        Raises:
+            ValueError: If the body does not say which link carries the patch, or a joint or link
+                is not the bundled HSR's.
+        """
+        if self.config.frame == "link":
+            return None
+        if not self.body.links:
+            raise ValueError('frame="base" needs the link of every patch: give Body(links=...)')
+        if self._kinematics is None:
+            from hasm_torch.robot import Kinematics
+
+            self._kinematics = Kinematics(device=str(positions.device))
+        named = dict(zip(self.body.joints, positions.unbind(-1)))
+        pose = self._kinematics.forward_named(named)[
+            self.body.links[self.body.patches.index(patch)]
+        ]
+        return pose[..., :3, :3]
+
     def fit(self, episodes: Iterable[Recording]) -> FitReport:
         """Store episodes; see ``learning.learn``.
 
@@ -100,20 +135,21 @@ class HASM(nn.Module):
 
     def reset(self) -> None:
         """Forget the rollout: the next step starts from the measured joints."""
-        self._walk = Walk()
-        self._skin_state: SkinState | None = None
-        self.touched: list[str] = []
-        self.density = self.lower.new_zeros(len(self.body.patches))
+        self.rollout = self.new_rollout()
+
+    def new_rollout(self) -> Rollout:
+        """A control loop at its beginning, for ``step``."""
         window = max(1, round(self.config.rate_window_s * self.body.rate))
-        self._spikes: deque[Tensor] = deque(maxlen=window)
+        return Rollout(deque(maxlen=window), self.lower.new_zeros(len(self.body.patches)))
 
     @torch.no_grad()
-    def step(self, state: Tensor, skin: Tensor) -> Tensor:
+    def step(self, state: Tensor, skin: Tensor, rollout: Rollout | None = None) -> Tensor:
         """One control step.
 
         Args:
             state: (joints,) measured joint positions, rad or m.
             skin: (cells, points) or flat, force of every point of the skin, N.
+            rollout: The control loop to go on with, one a robot; by default the model's own.
 
         Returns:
             (joints,) target joint positions, within the joint limits. A reading that is not
@@ -126,31 +162,43 @@ class HASM(nn.Module):
         """
         state, skin = self._checked(state, skin)
         readable = bool(torch.isfinite(state).all() & torch.isfinite(skin).all())
-        walk = self._walk
+        rollout = self.rollout if rollout is None else rollout
+        walk = rollout.walk
         if walk.reference is None:
             if not bool(torch.isfinite(state).all()):
                 raise RuntimeError("no finite joint reading yet, so there is no position to hold")
             walk.reference = torch.clamp(state, self.lower, self.upper)
         if not readable:
-            self.touched = []
+            rollout.touched = []
             return walk.reference.clone()
-        counts, _, self._skin_state = self.skin(skin.unsqueeze(0), self._skin_state)
-        self._spikes.append(counts[0])
-        self.density = density = self._density()
-        self.touched = touched = [
+        counts, _, rollout.skin = self.skin(skin.unsqueeze(0), rollout.skin)
+        rollout.spikes.append(counts[0])
+        rollout.density = density = self._density(rollout.spikes)
+        rollout.touched = touched = [
             patch
             for patch, count in zip(self.body.patches, counts[0].tolist())
             if count > 0 and patch in self.memories
         ]
-        self._note_onsets(touched, state)
+        self._note_onsets(walk, touched, state)
         target = walk.reference
         for patch in touched:
             index = self.body.patches.index(patch)
-            target = self._move(target, patch, float(counts[0, index]), density[index], state)
+            spikes = float(counts[0, index])
+            target = self._move(walk, target, patch, spikes, density[index], state)
         if touched:
             target = limit_speed(walk.reference, target, self.max_speed, 1.0 / self.body.rate)
             walk.reference = torch.clamp(target, self.lower, self.upper)
         return walk.reference.clone()
+
+    @property
+    def touched(self) -> list[str]:
+        """Patches with a memory that spiked in the last step."""
+        return self.rollout.touched
+
+    @property
+    def density(self) -> Tensor:
+        """(patches,) rate density ρ of every patch at the last step."""
+        return self.rollout.density
 
     @property
     def reference(self) -> Tensor:
@@ -159,27 +207,33 @@ class HASM(nn.Module):
         Raises:
             RuntimeError: If no step was made since the reset.
         """
-        if self._walk.reference is None:
+        if self.rollout.walk.reference is None:
             raise RuntimeError("no step was made since the reset, so there is no reference yet")
-        return self._walk.reference
+        return self.rollout.walk.reference
 
     def _move(
-        self, reference: Tensor, patch: str, spikes: float, density: Tensor, state: Tensor
+        self,
+        walk: Walk,
+        reference: Tensor,
+        patch: str,
+        spikes: float,
+        density: Tensor,
+        state: Tensor,
     ) -> Tensor:
-        memory = self.memories[patch]
-        assert isinstance(memory, PatchMemory)
+        memory = self.memory(patch)
         if self.config.advance == "tick":
             moved = reference.clone()
-            moved[memory.joints] = memory(state[memory.joints], density)[0]
+            link = self.link_rotation(patch, state)
+            moved[memory.joints] = memory(state[memory.joints], density, link)[0]
             return moved
         lag = (state - reference).abs()[memory.joints]
         if bool((lag > self.tolerance[memory.joints]).any()):
             return reference  # the joints are held up: wait for them
-        return advance(reference, self._walk, patch, memory, spikes, density)
+        link = self.link_rotation(patch, reference)
+        return advance(reference, walk, patch, memory, spikes, density, link)
 
-    def _note_onsets(self, touched: list[str], state: Tensor) -> None:
+    def _note_onsets(self, walk: Walk, touched: list[str], state: Tensor) -> None:
         """Where a new touch begins, take up joints that were moved meanwhile."""
-        walk = self._walk
         assert walk.reference is not None
         onset = ONSET_AFTER * self.body.rate
         if any(walk.quiet.get(patch, onset) >= onset for patch in touched):
@@ -194,10 +248,10 @@ class HASM(nn.Module):
         for patch in self.memories:
             walk.quiet[patch] = 0 if patch in touched else walk.quiet.get(patch, 0) + 1
 
-    def _density(self) -> Tensor:
+    def _density(self, spikes: deque[Tensor]) -> Tensor:
         """Rate density ρ of every patch over the last window, (patches,)."""
-        window = self._spikes.maxlen or 1
-        rate = torch.stack(list(self._spikes)).sum(0) * (self.body.rate / window)
+        window = spikes.maxlen or 1
+        rate = torch.stack(list(spikes)).sum(0) * (self.body.rate / window)
         return torch.clamp(rate / self.config.max_rate, 0.0, 1.0)
 
     def _checked(self, state: Tensor, skin: Tensor) -> tuple[Tensor, Tensor]:
@@ -206,7 +260,7 @@ class HASM(nn.Module):
         joints, cells = len(self.body.joints), sum(self.body.cells)
         if state.shape != (joints,):
             raise ValueError(f"expected state ({joints},), got {tuple(state.shape)}")
-        if skin.ndim == 1 and skin.numel() % cells == 0:
+        if skin.ndim == 1 and len(skin) and len(skin) % cells == 0:
             skin = skin.reshape(cells, -1)
         if skin.ndim != 2 or len(skin) != cells:
             raise ValueError(f"expected skin ({cells}, points) or flat, got {tuple(skin.shape)}")
@@ -217,7 +271,7 @@ class HASM(nn.Module):
         return sum(memory.memory.memory_bytes() for memory in self.memories.values())  # type: ignore[union-attr, operator]
 
     def save_pretrained(self, directory: str | Path) -> None:
-        """Write ``config.json`` and ``model.safetensors``, whole or not at all.
+        """Write a checkpoint; see ``checkpoint``.
 
         Args:
             directory: Made if it is not there.
@@ -225,48 +279,20 @@ class HASM(nn.Module):
         Raises:
             RuntimeError: If the model has learned nothing.
         """
-        from safetensors.torch import save_file
-
-        if not self.memories:
-            raise RuntimeError("nothing to save: the model has learned nothing yet")
-        directory = Path(directory)
-        directory.mkdir(parents=True, exist_ok=True)
-        partial = directory / (WEIGHTS_FILE + ".partial")
-        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, partial)
-        partial.replace(directory / WEIGHTS_FILE)
-        content: dict[str, Any] = {
-            "config": as_dict(self.config),
-            "body": as_dict(self.body),
-            "memories": {patch: as_dict(shape) for patch, shape in self.shapes.items()},
-        }
-        write_json(directory / CONFIG_FILE, content)
+        checkpoint.save(self, Path(directory))
 
     @classmethod
     def from_pretrained(cls, directory: str | Path) -> "HASM":
-        """Load what ``save_pretrained`` wrote.
+        """Load what ``save_pretrained``, ``train.py`` or LeRobot's training wrote.
 
         Raises:
             FileNotFoundError: If a file is missing.
-            ValueError: If a file is damaged or the two do not belong together.
+            ValueError: If a file is damaged, holds no memory, or does not belong to the other.
         """
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-
-        directory = Path(directory)
-        for name in (CONFIG_FILE, WEIGHTS_FILE):
-            if not (directory / name).is_file():
-                raise FileNotFoundError(
-                    f"no {name} in checkpoint {directory}: expected a directory written by "
-                    "train.py or HASM.save_pretrained"
-                )
+        settings = checkpoint.read_settings(Path(directory))
         try:
-            content = json.loads((directory / CONFIG_FILE).read_text())
-            shapes = {p: MemoryShape(**shape) for p, shape in content["memories"].items()}
-            model = cls(HASMConfig(**content["config"]), Body(**content["body"]), shapes)
-            model.load_state_dict(load_file(directory / WEIGHTS_FILE))
-        except (json.JSONDecodeError, KeyError, TypeError, RuntimeError, SafetensorError) as error:
-            raise ValueError(
-                f"checkpoint {directory} is damaged or from another version: {error}; "
-                "train again with train.py"
-            ) from error
+            model = cls(settings.config, settings.body, settings.shapes)
+        except (ValueError, LookupError, TypeError, RuntimeError) as error:
+            raise checkpoint.damaged(Path(directory), error) from error
+        checkpoint.load_weights(model, Path(directory))
         return model

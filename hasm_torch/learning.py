@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hasm_torch.config import MemoryShape
 from hasm_torch.successors import distinct_links, shifted_links
@@ -101,13 +101,22 @@ def learn(model: "HASM", episodes: Iterable[Recording]) -> FitReport:
             f"none of the {count} episodes holds a touch that makes a neuron spike; "
             "check the tactile feature's unit (N) and current_per_newton"
         )
-    for patch in list(model.memories):
-        del model.memories[patch], model.shapes[patch]
     report = FitReport(count, {}, {}, {}, {})
-    for patch, found in chains.items():
-        joints = _moved_joints(model, found)
-        if joints:
-            _store(model, patch, joints, found, report)
+    held = model.memories, model.shapes
+    model.memories, model.shapes = nn.ModuleDict(), {}
+    try:
+        for patch, found in chains.items():
+            joints = _moved_joints(model, found)
+            if joints:
+                _store(model, patch, joints, found, report)
+        if not report.associations:
+            raise ValueError(
+                f"no joint moves under touch in any of the {count} episodes: expected one to "
+                f"travel more than {MOVED_SHARE:.0%} of its range"
+            )
+    except BaseException:
+        model.memories, model.shapes = held
+        raise
     span = model.upper - model.lower
     model.tolerance.copy_(LAG_FACTOR * lag + 0.02 * span)
     return report
@@ -125,22 +134,30 @@ def _positions(model: "HASM", episode: Recording, index: int) -> tuple[Tensor, T
         if not torch.isfinite(values).all():
             raise ValueError(f"episode {index}: {name} holds NaN or infinity")
         series.append(torch.clamp(values, model.lower, model.upper))
+    if len(series[0]) == 0 or len(series[0]) != len(series[1]):
+        raise ValueError(
+            f"episode {index}: expected as many states as actions and at least one, got "
+            f"{len(series[0])} and {len(series[1])}"
+        )
     return series[0], series[1]
 
 
 def _touches(model: "HASM", episode: Recording, state: Tensor, action: Tensor) -> dict[str, Chain]:
     """The chain of every patch that spiked in an episode."""
     config, body = model.config, model.body
+    if episode.tactile is None:
+        raise ValueError("an episode has no tactile series, so there is no touch to learn from")
     skin = torch.as_tensor(episode.tactile, dtype=torch.float32)
-    if not torch.isfinite(skin).all():
-        raise ValueError("the tactile series holds NaN or infinity")
-    counts, _, _ = model.skin(skin)
-    window = max(1, round(config.rate_window_s * body.rate))
-    total = torch.nn.functional.pad(counts.cumsum(0), (0, 0, window, 0))
-    rate = (total[window:] - total[:-window]) * (body.rate / window)
-    density = torch.clamp(rate / config.max_rate, 0.0, 1.0)
-    positions = action if config.pattern == "action" else state
+    if len(skin) != len(state) or len(episode.time) != len(state):
+        raise ValueError(
+            f"expected time and tactile of {len(state)} samples like the state, got "
+            f"{len(episode.time)} and {len(skin)}"
+        )
     time = torch.as_tensor(episode.time, dtype=torch.float64)
+    if not (torch.isfinite(skin).all() and torch.isfinite(time).all()):
+        raise ValueError("the time or tactile series holds NaN or infinity")
+    counts, density = spike_series(model, skin)
+    positions = action if config.pattern == "action" else state
     chains = {}
     for index, patch in enumerate(body.patches):
         spiked = time[counts[:, index] > 0]
@@ -150,6 +167,24 @@ def _touches(model: "HASM", episode: Recording, state: Tensor, action: Tensor) -
                 positions[kept], density[kept, index], counts[:, index].cumsum(0)[kept]
             )
     return chains
+
+
+def spike_series(model: "HASM", skin: Tensor) -> tuple[Tensor, Tensor]:
+    """What the patches of a whole episode felt.
+
+    Args:
+        model: Encodes the skin.
+        skin: (T, cells, points), N.
+
+    Returns:
+        Spikes in each sample period and rate density ρ, both (T, patches).
+    """
+    config, rate = model.config, model.body.rate
+    counts, _, _ = model.skin(skin)
+    window = max(1, round(config.rate_window_s * rate))
+    total = torch.nn.functional.pad(counts.cumsum(0), (0, 0, window, 0))
+    windowed = (total[window:] - total[:-window]) * (rate / window)
+    return counts, torch.clamp(windowed / config.max_rate, 0.0, 1.0)
 
 
 def _moved_joints(model: "HASM", chains: Sequence[Chain]) -> list[int]:
@@ -165,7 +200,8 @@ def _store(
 ) -> None:
     """Build and fill the memory of one patch."""
     config, body = model.config, model.body
-    positions = torch.cat([chain.positions[:, joints] for chain in chains])
+    everything = torch.cat([chain.positions for chain in chains])
+    positions = everything[:, joints]
     episodes = torch.cat([torch.full((len(c.spikes),), i) for i, c in enumerate(chains)])
     span = (model.upper - model.lower)[joints]
     if config.touch_levels == "nearest":
@@ -178,7 +214,7 @@ def _store(
     probe.touch_levels.copy_(levels)
     if config.store == "distinct":
         # A state felt at another touch level is another state: each level has walks of its own.
-        state, _ = probe.codes(positions, density)
+        state = probe.place_code(positions)
         rows, following, pace = [], [], []
         for level in range(len(levels)) if len(levels) else [None]:
             mine = torch.arange(len(density))
@@ -193,13 +229,16 @@ def _store(
         source, target, paces = torch.cat(rows), torch.cat(following), torch.cat(pace)
     else:
         source, target = shifted_links(episodes, config.horizon)
+        if not len(source):
+            raise ValueError(f"no touch of {patch} lasts longer than horizon={config.horizon}")
         paces = torch.ones(len(source))
     memory = model.add_memory(patch, MemoryShape(joints, len(source), len(levels)))
     memory.touch_levels.copy_(levels)
-    memory.write(positions[source], density[source], positions[target], paces)
+    link = model.link_rotation(patch, everything[source])
+    memory.write(positions[source], density[source], positions[target], paces, link)
     beta = config.beta if config.beta is not None else memory.memory.crowding().beta
     memory.memory.beta.fill_(beta)
-    recalled, _ = memory(positions[source], density[source])
+    recalled, _ = memory(positions[source], density[source], link)
     error = ((recalled - positions[target]).abs() / span).max()
     report.associations[patch] = len(source)
     report.joints[patch] = [body.joints[j] for j in joints]

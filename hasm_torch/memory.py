@@ -9,45 +9,20 @@ Signals", sections "Association Creation" and "Hetero-associative Sequential Mem
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple, Self, get_args
 
 import torch
 from torch import Tensor, nn
 
-from hasm_torch.bipolar import binarise, bind
-from hasm_torch.recall import pack, recall_dense, recall_packed, store, unpack
+from hasm_torch import functional
+from hasm_torch.association_store import INT8_STEPS, AssociationStore, Storage, WhenFull
+from hasm_torch.bipolar import binarise
+from hasm_torch.crowding import Crowding, crowding
+from hasm_torch.interaction import Interaction, check_interaction, interact
+from hasm_torch.recall import Recall, inspect_dense, inspect_packed, recall_dense, recall_packed
 from hasm_torch.rope3d import RoPE3D
 
-Storage = Literal["float32", "bfloat16", "int8", "bit"]
 
-# An int8 entry holds 1/64 steps: ±1 is exact, and ±√3, the most a rotated block of three ±1
-# entries can reach, still fits.
-INT8_STEPS = 64
-
-
-class Crowding(NamedTuple):
-    """How full and how crowded a memory is.
-
-    Attributes:
-        count: Associations held.
-        capacity: Associations that fit.
-        margin: Smallest lead of a stored association's match with itself over its best match
-            with a different association, in units of the inner product; ``code_dim`` if there is
-            no other.
-        crosstalk: Mean over the associations of the best match with another one, divided by the
-            match with itself.
-        beta: Inverse temperature at which a stored association outweighs all others together by
-            ``confidence``.
-    """
-
-    count: int
-    capacity: int
-    margin: float
-    crosstalk: float
-    beta: float
-
-
-class HeteroAssociativeMemory(nn.Module):
+class HeteroAssociativeMemory(AssociationStore):
     """Stores bound codes with what followed them, and recalls by similarity.
 
         m = s ⊗ RoPE3D(o; n, θ)                              (Association Creation)
@@ -57,77 +32,74 @@ class HeteroAssociativeMemory(nn.Module):
     ``torch.export`` see fixed shapes; ``count`` says how much is filled.
 
     Attributes:
-        associations: M, (capacity, code_dim), or packed as ``recall.pack`` does with ``storage="bit"``.
+        associations: M, (capacity, code_dim); with ``storage="bit"`` packed by ``recall.pack``.
         successors: S₋₁, (capacity, value_dim), float32 or better.
         count: () int64, number of associations held.
-        beta: β, () float32 or better; a parameter with ``learn_beta``.
+        oldest: () int64, row of the oldest association.
+        beta: β, () float32 or better.
         rope: The rotary embedding applied to observations.
 
     Args:
         code_dim: Entries of a code, D.
         value_dim: Entries of a successor.
         capacity: Associations that fit.
-        beta: Inverse temperature β of the softmax over unnormalised inner products.
+        beta: Inverse temperature β of the unnormalised inner products: a number, a tensor or a
+            parameter, which is then shared.
         learn_beta: Whether β is a parameter.
         storage: How associations are held: "float32"; "bfloat16"; "int8" (steps of 1/64, exact
-            for ±1); "bit" (one bit an entry: associations and queries are re-binarised by sign).
+            for ±1); "bit" (one bit an entry: associations and queries are taken by sign, exact
+            for ±1). Left out: float32 if patterns are learned or the associations take at most
+            256 MiB in it, else bit.
+        learn_patterns: Whether associations and successors are parameters (float32 only).
+        binarised: Whether associations and queries are taken by their sign, with a
+            straight-through gradient; always so with "bit".
+        interaction: "softmax"; "exponential" or a degree for a dense associative memory, whose
+            weights are not normalised.
+        when_full: "error" refuses a write that does not fit; "overwrite" replaces the oldest.
 
     Raises:
-        ValueError: If a size is below 1 or the storage is unknown.
+        ValueError: If a size is below 1, an option is unknown, or two options exclude each other.
     """
 
-    associations: Tensor
-    successors: Tensor
-    count: Tensor
+    beta: Tensor
 
     def __init__(
         self,
         code_dim: int,
         value_dim: int,
         capacity: int,
-        beta: float = 1.0,
+        beta: float | Tensor = 1.0,
         learn_beta: bool = False,
-        storage: Storage = "float32",
+        storage: Storage | None = None,
+        learn_patterns: bool = False,
+        binarised: bool = False,
+        interaction: Interaction = "softmax",
+        when_full: WhenFull = "error",
     ) -> None:
-        super().__init__()
-        for name, size in (("code_dim", code_dim), ("value_dim", value_dim)):
-            if size < 1:
-                raise ValueError(f"{name} must be at least 1, got {size}")
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1 association, got {capacity}")
-        if storage not in get_args(Storage):
-            raise ValueError(f"unknown storage {storage!r}, valid: {', '.join(get_args(Storage))}")
-        self.code_dim, self.value_dim, self.capacity = code_dim, value_dim, capacity
-        self.storage: Storage = storage
+        super().__init__(code_dim, value_dim, capacity, storage, learn_patterns, when_full)
+        check_interaction(interaction)
+        self.interaction = interaction
+        self.binarised = binarised or self.storage == "bit"
         self.rope = RoPE3D(code_dim)
-        if storage == "bit":
-            empty = torch.zeros_like(pack(torch.empty(capacity, code_dim)))
+        if isinstance(beta, nn.Parameter):
+            self.beta = beta
         else:
-            empty = torch.zeros(capacity, code_dim, dtype=getattr(torch, storage))
-        self.register_buffer("associations", empty)
-        self.register_buffer("successors", torch.zeros(capacity, value_dim))
-        self.register_buffer("count", torch.zeros((), dtype=torch.int64))
-        value = torch.as_tensor(beta, dtype=torch.float32).detach().clone()
-        if learn_beta:
-            self.beta = nn.Parameter(value)
-        else:
-            self.register_buffer("beta", value)
+            value = torch.as_tensor(beta).detach().clone()
+            value = value.to(torch.promote_types(value.dtype, torch.float32)).reshape(())
+            if learn_beta:
+                self.beta = nn.Parameter(value)
+            else:
+                self.register_buffer("beta", value)
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        # Joint positions and β keep float32 or better, whatever the dtype of the codes.
-        kept = {"successors": self.successors, "beta": self.beta}
-        super()._apply(fn, recurse)
-        for name, before in kept.items():
-            now = getattr(self, name)
-            if now.dtype in (torch.float16, torch.bfloat16):
-                now.data = before.data.to(now.device)
-        return self
+    @property
+    def _precise(self) -> tuple[str, ...]:
+        return ("successors", "beta")
 
     def extra_repr(self) -> str:
-        """Sizes and storage, as printed."""
+        """Sizes and options, as printed."""
         return (
             f"code_dim={self.code_dim}, value_dim={self.value_dim}, capacity={self.capacity}, "
-            f"storage={self.storage!r}"
+            f"storage={self.storage!r}, interaction={self.interaction!r}"
         )
 
     def associate(
@@ -142,7 +114,7 @@ class HeteroAssociativeMemory(nn.Module):
         Args:
             state: s, (..., code_dim).
             observation: o, (..., code_dim).
-            axis: Unit rotation axis of the touch, (..., 3); without it nothing is rotated.
+            axis: Rotation axis of the touch, (..., 3); without it nothing is rotated.
             angle: Rotation angle of the touch, (...,), rad.
 
         Returns:
@@ -156,11 +128,18 @@ class HeteroAssociativeMemory(nn.Module):
                 raise ValueError(
                     f"expected {name} code (..., {self.code_dim}), got {tuple(code.shape)}"
                 )
-        if (axis is None) != (angle is None):
-            raise ValueError("axis and angle describe one rotation: give both or neither")
-        if axis is not None and angle is not None:
-            observation = self.rope(observation, axis, angle)
-        return bind(state, observation)
+        return functional.associate(state, observation, axis, angle)
+
+    def crowding(self, confidence: float = 1e6) -> Crowding:
+        """Report how full and how crowded the memory is, with a β that fits; see ``crowding``.
+
+        Args:
+            confidence: Ratio of the right weight to all others together at the suggested β.
+
+        Raises:
+            ValueError: If the memory is empty.
+        """
+        return crowding(self.stored(), self.capacity, confidence)
 
     def forward(
         self,
@@ -168,150 +147,141 @@ class HeteroAssociativeMemory(nn.Module):
         observation: Tensor,
         axis: Tensor | None = None,
         angle: Tensor | None = None,
+        mask: Tensor | None = None,
     ) -> Tensor:
-        """Decide what follows a state under an observation; shapes as in ``associate``.
+        """Decide what follows a state under an observation; arguments as in ``associate``.
 
-        Returns:
-            Decision d, (..., value_dim).
-        """
-        return self.recall(self.associate(state, observation, axis, angle))
-
-    def recall(self, query: Tensor) -> Tensor:
-        """Recall the decision for a query.
-
-        Args:
-            query: q, (..., code_dim).
-
-        Returns:
-            Decision d, (..., value_dim); differentiable in query, β and the stored patterns
-            unless the storage is "bit".
-
-        Raises:
-            ValueError: If the query has another length.
-            RuntimeError: If the memory is empty.
-        """
-        self._check_query(query)
-        if self.storage == "bit":
-            return recall_packed(
-                query, self.associations, self.successors, self.beta, count=self.count
-            )
-        scale = INT8_STEPS if self.storage == "int8" else 1
-        return recall_dense(
-            query, self.associations, self.successors, self.beta / scale, count=self.count
-        )
-
-    def weights(self, query: Tensor) -> Tensor:
-        """The softmax weight of every stored association, softmax(β Mᵀ q).
-
-        Args:
-            query: q, (..., code_dim).
-
-        Returns:
-            (..., count), at least float32.
-        """
-        self._check_query(query)
-        stored = self.stored().float()
-        if self.storage == "bit":
-            query = binarise(query)
-        return torch.softmax(self.beta * (query.to(stored.dtype) @ stored.mT), dim=-1)
-
-    @torch.no_grad()
-    def write(
-        self,
-        state: Tensor,
-        observation: Tensor,
-        successor: Tensor,
-        axis: Tensor | None = None,
-        angle: Tensor | None = None,
-    ) -> None:
-        """Store what followed a state under an observation.
+        Leading dimensions may hold a whole sequence.
 
         Args:
             state: s, (..., code_dim).
             observation: o, (..., code_dim).
-            successor: What followed, (..., value_dim), finite.
-            axis: Unit rotation axis of the touch, (..., 3).
+            axis: Rotation axis of the touch, (..., 3).
             angle: Rotation angle of the touch, (...,), rad.
+            mask: Rows that each query may recall, (..., capacity) bool.
 
-        Raises:
-            ValueError: If a shape is off or a value is not finite; nothing is stored then.
-            RuntimeError: If the memory has no room for all of them; nothing is stored then.
+        Returns:
+            Decision d, (..., value_dim).
         """
-        association = self.associate(state, observation, axis, angle)
-        if successor.shape != (*association.shape[:-1], self.value_dim):
-            raise ValueError(
-                f"expected successor {(*association.shape[:-1], self.value_dim)}, "
-                f"got {tuple(successor.shape)}"
-            )
-        if not (torch.isfinite(association).all() and torch.isfinite(successor).all()):
-            raise ValueError("codes and successors must be finite, got NaN or infinity")
-        association = association.reshape(-1, self.code_dim)
-        held, new = int(self.count), len(association)
-        if held + new > self.capacity:
-            raise RuntimeError(
-                f"the memory is full: it holds {held} of {self.capacity} associations and {new} "
-                "more were to be written; build it with a larger capacity"
-            )
-        if self.storage == "bit":
-            rows = torch.arange(held, held + new, device=association.device)
-            store(self.associations, rows, association)
-        elif self.storage == "int8":
-            steps = (association * INT8_STEPS).round().clamp(-127, 127)
-            self.associations[held : held + new] = steps.to(torch.int8)
-        else:
-            self.associations[held : held + new] = association.to(self.associations.dtype)
-        self.successors[held : held + new] = successor.reshape(-1, self.value_dim).to(
-            self.successors.dtype
-        )
-        self.count.add_(new)
+        return self.recall(self.associate(state, observation, axis, angle), mask)
 
-    def clear(self) -> None:
-        """Forget every association."""
-        self.count.zero_()
-
-    def stored(self) -> Tensor:
-        """The associations held, (count, code_dim), as real numbers."""
-        if self.storage == "bit":
-            return unpack(self.associations, self.code_dim)[: int(self.count)]
-        rows = self.associations[: int(self.count)]
-        return rows.float() / INT8_STEPS if self.storage == "int8" else rows
-
-    def memory_bytes(self) -> int:
-        """Resident bytes of the buffers for associations and successors."""
-        return self.associations.nbytes + self.successors.nbytes
-
-    def crowding(self, confidence: float = 1e6) -> Crowding:
-        """Report how full the memory is and how alike its associations are.
-
-        Identical associations are one address and count once.
+    def recall(self, query: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Recall the decision for queries.
 
         Args:
-            confidence: Ratio of the right weight to the sum of all others that ``beta`` in the
-                report reaches: β = ln(confidence · (count − 1)) / margin.
+            query: q, (..., code_dim).
+            mask: Rows that each query may recall, (..., capacity) bool.
+
+        Returns:
+            Decision d, (..., value_dim); differentiable in the query, β and the stored patterns,
+            in those of "bit" storage in β and the successors alone.
 
         Raises:
+            ValueError: If a shape is off.
             RuntimeError: If the memory is empty.
         """
-        self._check_filled()
-        stored = torch.unique(self.stored().float(), dim=0)
-        own = (stored**2).sum(-1)
-        rival = torch.full_like(own, -torch.inf)
-        for rows in torch.arange(len(stored), device=stored.device).split(1024):
-            scores = stored[rows] @ stored.mT
-            scores[torch.arange(len(rows), device=stored.device), rows] = -torch.inf
-            rival[rows] = scores.amax(-1)
-        if len(stored) == 1:
-            rival = torch.zeros_like(own)
-        margin = float((own - rival).min())
-        others = max(len(stored) - 1, 1)
-        beta = float(torch.log(torch.tensor(confidence * others))) / max(margin, 1e-6)
-        return Crowding(int(self.count), self.capacity, margin, float((rival / own).mean()), beta)
+        self._check_query(query)
+        with torch.autocast(query.device.type, enabled=False):
+            if self.interaction != "softmax":
+                weights = self._interacting(query, mask)
+                return weights.to(self.successors.dtype) @ self.successors
+            if self.storage == "bit":
+                return recall_packed(*self._packed(query), count=self.count, mask=mask)
+            return recall_dense(*self._dense(query), count=self.count, mask=mask)
+
+    def inspect(self, query: Tensor, mask: Tensor | None = None) -> Recall:
+        """Recall, and tell how sure the memory is: a confident recall from a guess.
+
+        Args:
+            query: q, (..., code_dim).
+            mask: Rows that each query may recall, (..., capacity) bool.
+
+        Returns:
+            ``decision`` (..., value_dim); ``match`` (...,) row of the best match; ``score`` (...,)
+            its inner product with the query; ``margin`` (...,) its lead over the second best;
+            ``entropy`` (...,) of the weights, nats, 0 if one association decides alone.
+
+        Raises:
+            ValueError: If a shape is off, or the interaction is not "softmax".
+            RuntimeError: If the memory is empty.
+        """
+        self._check_query(query)
+        if self.interaction != "softmax":
+            raise ValueError(
+                f"inspect needs normalised weights, interaction 'softmax', got {self.interaction!r}"
+            )
+        with torch.autocast(query.device.type, enabled=False):
+            if self.storage == "bit":
+                return inspect_packed(*self._packed(query), count=self.count, mask=mask)
+            recalled = inspect_dense(*self._dense(query), count=self.count, mask=mask)
+        scale = self._score_scale
+        return recalled._replace(score=recalled.score / scale, margin=recalled.margin / scale)
+
+    def weights(self, query: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Weight of every stored association in the decision.
+
+        Args:
+            query: q, (..., code_dim).
+            mask: Rows that each query may recall, (..., capacity) bool.
+
+        Returns:
+            (..., capacity), 0 for rows that are empty or masked.
+        """
+        self._check_query(query)
+        with torch.autocast(query.device.type, enabled=False):
+            return self._interacting(query, mask)
+
+    def iterate(
+        self,
+        state: Tensor,
+        steps: int,
+        encode: Callable[[Tensor], Tensor] = binarise,
+        observation: Tensor | None = None,
+    ) -> Tensor:
+        """Recall again and again, each decision encoded as the next state.
+
+        Args:
+            state: s of the start, (..., code_dim).
+            steps: Number of recalls.
+            encode: Turns a decision (..., value_dim) into a state code (..., code_dim).
+            observation: o that stays, (..., code_dim), already rotated; none for an unbound state.
+
+        Returns:
+            (..., steps, value_dim) the decisions in order.
+        """
+        decisions = []
+        for _ in range(steps):
+            query = state if observation is None else self.associate(state, observation)
+            decisions.append(self.recall(query))
+            state = encode(decisions[-1])
+        return torch.stack(decisions, dim=-2)
+
+    def _packed(self, query: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return query, self.associations, self.successors, self.beta
+
+    def _dense(self, query: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        associations = self.associations
+        if self.binarised:
+            query, associations = binarise(query), binarise(associations)
+        return query, associations, self.successors, self.beta / self._score_scale
+
+    @property
+    def _score_scale(self) -> int:
+        """What a stored entry's integer steps multiply the inner products by."""
+        return INT8_STEPS if self.storage == "int8" and not self.binarised else 1
+
+    def _interacting(self, query: Tensor, mask: Tensor | None) -> Tensor:
+        codes = self._codes().to(torch.promote_types(query.dtype, torch.float32))
+        if self.binarised:
+            query, codes = binarise(query), binarise(codes)
+        scores = query.to(codes.dtype) @ codes.mT
+        absent = torch.arange(self.capacity, device=query.device) >= self.count
+        if mask is not None:
+            absent = absent | ~mask
+        return interact(scores.masked_fill(absent, torch.nan), self.beta, self.interaction)
 
     def _check_query(self, query: Tensor) -> None:
         if query.shape[-1] != self.code_dim:
             raise ValueError(f"expected query (..., {self.code_dim}), got {tuple(query.shape)}")
-        self._check_filled()
-
-    def _check_filled(self) -> None:
         if not torch.compiler.is_compiling() and int(self.count) == 0:
             raise RuntimeError("the memory is empty: write at least one association first")

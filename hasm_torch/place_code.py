@@ -148,6 +148,12 @@ class PlaceCode(nn.Module):
             ValueError: if `q` has another shape, or holds a non-finite position (not checked
                 under torch.compile, where a check would wait for the device).
         """
+        self.check(q)
+        rates = spike_rates(q, self.lower, self.upper, self.neurons, self.width)
+        return quantise(rates, self.bits, self.code).flatten(-2)
+
+    def check(self, q: Tensor) -> None:
+        """Refuse joint positions of another shape, or not finite; arguments as in ``levels``."""
         if q.ndim == 0 or q.shape[-1] != self.joints:
             raise ValueError(
                 f"expected joint positions of shape (..., {self.joints}), got {tuple(q.shape)}"
@@ -157,8 +163,6 @@ class PlaceCode(nn.Module):
             if not finite.all():
                 joints = (~finite).reshape(-1, self.joints).any(0).nonzero().flatten().tolist()
                 raise ValueError(f"expected finite joint positions, got others at joints {joints}")
-        rates = spike_rates(q, self.lower, self.upper, self.neurons, self.width)
-        return quantise(rates, self.bits, self.code).flatten(-2)
 
     def forward(self, q: Tensor) -> Tensor:
         """Place code of joint positions: (..., J) -> (..., D) in {-1, +1}, in the dtype of q."""

@@ -111,13 +111,13 @@ class RoPE3D(nn.Module):
     """Rotary embedding of codes with `dim` entries; it holds no parameters and no buffers.
 
     Args:
-        dim: d, the number of entries of a code, at least 3.
+        dim: d, the number of entries of a code; with fewer than 3 there is nothing to turn.
     """
 
     def __init__(self, dim: int) -> None:
         super().__init__()
-        if dim < 3:
-            raise ValueError(f"expected dim >= 3, one block to turn, got {dim}")
+        if dim < 1:
+            raise ValueError(f"expected dim >= 1, got {dim}")
         self.dim = dim
 
     def forward(self, x: Tensor, axis: Tensor, angle: Tensor) -> Tensor:

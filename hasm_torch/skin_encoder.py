@@ -12,14 +12,14 @@ import torch
 from torch import Tensor, nn
 
 from hasm_torch.izhikevich import Izhikevich, IzhikevichState
-from hasm_torch.touch import EffectiveForce
+from hasm_torch.touch import cell_excess
 
 
 class SkinState(NamedTuple):
     """What a stream of skin samples needs to go on.
 
     Attributes:
-        recent: (..., window − 1, cells, points), the last samples, N.
+        recent: (..., window − 1, patches), effective force of the last samples, N.
         neurons: Membrane state of the (..., patches) neurons.
     """
 
@@ -40,10 +40,11 @@ class SkinEncoder(nn.Module):
         spike_dt_ms: Integration step, ms; divides the sample period.
 
     Raises:
-        ValueError: If there is no patch, or the sample period is not a multiple of the step.
+        ValueError: If there is no patch, a rate, step or window is not positive, the threshold is
+            negative, or the sample period is not a multiple of the step.
     """
 
-    gather: Tensor
+    patch_of_cell: Tensor
 
     def __init__(
         self,
@@ -57,6 +58,14 @@ class SkinEncoder(nn.Module):
         super().__init__()
         if not cells:
             raise ValueError("a skin needs at least one patch, got none")
+        if not (rate > 0 and spike_dt_ms > 0):
+            raise ValueError(
+                f"expected rate and spike_dt_ms above 0, got {rate} Hz and {spike_dt_ms} ms"
+            )
+        if window < 1 or not threshold >= 0:
+            raise ValueError(
+                f"expected window >= 1 sample and threshold >= 0 N, got {window} and {threshold}"
+            )
         steps = 1000.0 / rate / spike_dt_ms
         if abs(steps - round(steps)) > 1e-6:
             raise ValueError(
@@ -64,17 +73,12 @@ class SkinEncoder(nn.Module):
                 f"got {spike_dt_ms} ms"
             )
         self.steps = round(steps)
-        self.rate, self.total = rate, sum(cells)
+        self.rate, self.patches, self.total = rate, len(cells), sum(cells)
+        self.threshold, self.window = threshold, window
         self.current_per_newton = current_per_newton
-        self.force = EffectiveForce(threshold, window)
         self.neuron = Izhikevich(dt_ms=spike_dt_ms)
-        # Row p lists the cells of patch p; shorter patches point at a cell of zero force.
-        gather = torch.full((len(cells), max(cells)), self.total)
-        start = 0
-        for patch, count in enumerate(cells):
-            gather[patch, :count] = torch.arange(start, start + count)
-            start += count
-        self.register_buffer("gather", gather)
+        patch_of_cell = torch.repeat_interleave(torch.arange(len(cells)), torch.tensor(cells))
+        self.register_buffer("patch_of_cell", patch_of_cell)
 
     def forward(
         self, skin: Tensor, state: SkinState | None = None
@@ -96,15 +100,17 @@ class SkinEncoder(nn.Module):
             raise ValueError(
                 f"expected skin (..., T, {self.total}, points), got {tuple(skin.shape)}"
             )
-        window = self.force.window
-        shape = (*skin.shape[:-3], window - 1, *skin.shape[-2:])
-        recent = state.recent if state is not None else skin.new_zeros(shape)
-        stream = torch.cat([recent, skin], dim=-3)
-        padded = torch.nn.functional.pad(stream, (0, 0, 0, 1))
-        patches = padded[..., self.gather, :].movedim(-3, -4)  # (..., patches, T, cells, points)
-        force = self.force(patches)[..., window - 1 :] / window
-        current = self.current_per_newton * force.repeat_interleave(self.steps, dim=-1)
+        excess = cell_excess(skin, self.threshold)
+        totals = excess.new_zeros(*excess.shape[:-1], self.patches)
+        totals = totals.index_add_(-1, self.patch_of_cell, excess)
+        before = totals.new_zeros(*totals.shape[:-2], self.window - 1, self.patches)
+        stream = torch.cat([before if state is None else state.recent, totals], dim=-2)
+        # Added in order of time, so that rounding does not depend on the length of the chunk.
+        shifts = (stream[..., i : i + skin.shape[-3], :] for i in range(self.window))
+        force = sum(shifts, torch.zeros_like(totals)) / self.window
+        # One sample of current a step, held over the sample period.
+        current = (self.current_per_newton * force).mT.unsqueeze(-1)
+        current = current.expand(*current.shape[:-1], self.steps).flatten(-2)
         spikes, neurons = self.neuron(current, None if state is None else state.neurons)
-        counts = spikes.unflatten(-1, (-1, self.steps)).sum(-1)
-        after = SkinState(stream[..., stream.shape[-3] - window + 1 :, :, :], neurons)
-        return counts.movedim(-1, -2), force.movedim(-1, -2), after
+        counts = spikes.unflatten(-1, (-1, self.steps)).sum(-1).mT
+        return counts, force, SkinState(stream[..., skin.shape[-3] :, :], neurons)

@@ -61,7 +61,7 @@ def shifted_links(episodes: Tensor, horizon: int = 1) -> tuple[Tensor, Tensor]:
         raise ValueError(
             f"episodes must be (T,), one integer a sample, got {tuple(episodes.shape)}"
         )
-    index = torch.arange(len(episodes) - horizon, device=episodes.device)
+    index = torch.arange(max(len(episodes) - horizon, 0), device=episodes.device)
     inside = episodes[index] == episodes[index + horizon]
     return index[inside], index[inside] + horizon
 

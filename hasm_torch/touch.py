@@ -15,6 +15,19 @@ from torch import Tensor, nn
 from hasm_torch.bipolar import to_bipolar
 
 
+def cell_excess(forces: Tensor, threshold: float) -> Tensor:
+    """Soft-thresholded force of each cell, m_c = max(0, |f_c1| + |f_c2| + |f_c3| - tau).
+
+    Args:
+        forces: (..., 3), N.
+        threshold: tau, N.
+
+    Returns:
+        (...,), N.
+    """
+    return (forces.abs().sum(-1) - threshold).clamp(min=0)
+
+
 def effective_force(forces: Tensor, threshold: float, window: int) -> Tensor:
     """Effective force on a patch: the excess of its cells over the threshold, over a window.
 
@@ -32,8 +45,7 @@ def effective_force(forces: Tensor, threshold: float, window: int) -> Tensor:
     if forces.ndim < 3 or forces.shape[-1] != 3:
         raise ValueError(f"expected forces of shape (..., T, cells, 3), got {tuple(forces.shape)}")
     _check_force_options(threshold, window)
-    cells = (forces.abs().sum(-1) - threshold).clamp(min=0)
-    total = cells.sum(-1)
+    total = cell_excess(forces, threshold).sum(-1)
     if total.shape[-1] == 0:
         return total
     # summed window by window: differences of a running sum would keep old rounding errors

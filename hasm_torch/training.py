@@ -29,15 +29,15 @@ class TrainConfig:
 
     Attributes:
         dataset: Which dataset to learn from.
-        output_dir: Where the checkpoint goes.
         method: "default", with the settings under ``model``, or "literal", the paper as written.
         model: Settings of the method.
+        output_dir: Where the checkpoint goes.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    output_dir: Path | None = None
     method: Literal["default", "literal"] = "default"
     model: HASMConfig = field(default_factory=HASMConfig)
+    output_dir: Path | None = None
 
 
 @dataclass

@@ -200,8 +200,8 @@ def test_touch_rotation_gradients():
 
 
 def test_errors_say_what_was_expected():
-    with pytest.raises(ValueError, match=r"dim >= 3.*got 2"):
-        RoPE3D(2)
+    with pytest.raises(ValueError, match=r"dim >= 1.*got 0"):
+        RoPE3D(0)
     with pytest.raises(ValueError, match=r"\(\.\.\., 10\), got \(4, 9\)"):
         RoPE3D(10)(torch.zeros(4, 9), torch.zeros(3), torch.zeros(()))
     with pytest.raises(ValueError, match=r"axis of shape \(\.\.\., 3\), got \(2,\)"):

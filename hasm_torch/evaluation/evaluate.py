@@ -12,11 +12,13 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from hasm_torch.config import HASMConfig, write_json
+from hasm_torch.config import Body, HASMConfig, write_json
 from hasm_torch.evaluation import compliance, grasp
 from hasm_torch.evaluation.report import table
 from hasm_torch.evaluation.runner import EXPERIMENTS, check_experiments, run_cases
 from hasm_torch.hasm import HASM
+from hasm_torch.robot import JOINTS, Skin
+from hasm_torch.sim.env import LARGEST_FORCE
 from hasm_torch.training import settings, train
 
 ROLLOUTS = {"compliance": 40, "grasp": 100}
@@ -36,12 +38,13 @@ class EvalConfig:
         model: Settings of the method, where a model is trained.
         rollouts: Rollouts a compliance behaviour, and grasps; by default 40 and 100.
         seed: Seed of everything that is drawn.
-        forces: Forces of the touches, N, 0.5 to 30, taken in turn; by default drawn from 2 to
+        forces: Forces of the touches, N, 0.5 to 15, taken in turn; by default drawn from 2 to
             14 N (compliance) and 3 to 12 N (grasp).
         start_noise: Noise of a grasp's start state, rad; the arm lift gets a fifth of it in m.
         object_noise: The object stands up to this far from its place along x and y, m.
         pauses: Random pauses in a grasp.
         render: Whether to make videos.
+        rerun: Whether to write a recording of a rollout for the Rerun viewer.
         output_dir: Where results go; by default ``outputs/eval/<time>``.
     """
 
@@ -57,6 +60,7 @@ class EvalConfig:
     object_noise: float = 0.01
     pauses: int = 3
     render: bool = True
+    rerun: bool = False
     output_dir: Path | None = None
 
     def __post_init__(self) -> None:
@@ -66,8 +70,8 @@ class EvalConfig:
         if self.rollouts is not None and self.rollouts < 1:
             raise ValueError(f"rollouts must be at least 1, got {self.rollouts}")
         for force in self.forces:
-            if not 0.5 <= force <= 30.0:
-                raise ValueError(f"forces must be 0.5 to 30 N, got {force}")
+            if not 0.5 <= force <= LARGEST_FORCE:
+                raise ValueError(f"forces must be 0.5 to {LARGEST_FORCE:g} N, got {force}")
         for name in ("start_noise", "object_noise", "pauses"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(
@@ -90,6 +94,8 @@ def evaluate(config: EvalConfig) -> dict[str, Any]:
     """
     directory = config.output_dir or Path("outputs/eval") / f"{datetime.now():%Y%m%d-%H%M%S}"
     models, seconds = _models(config)
+    for model in models.values():
+        _check_robot(model.body)
     directory.mkdir(parents=True, exist_ok=True)
     metrics: dict[str, Any] = {}
     for experiment, model in models.items():
@@ -127,6 +133,18 @@ def _models(config: EvalConfig) -> tuple[dict[str, HASM], float | None]:
         models[experiment] = trained.model
         seconds += trained.seconds
     return models, seconds
+
+
+def _check_robot(body: Body) -> None:
+    skin = Skin.load()
+    cells = [skin.slices[patch].stop - skin.slices[patch].start for patch in skin.patches]
+    for what, mine, robots in (
+        ("joints", body.joints, list(JOINTS)),
+        ("patches", body.patches, list(skin.patches)),
+        ("cells", body.cells, cells),
+    ):
+        if mine != robots:
+            raise ValueError(f"the simulated robot has the {what} {robots}, the model's are {mine}")
 
 
 def _plan(experiment: str, config: EvalConfig) -> list[Any]:
@@ -186,6 +204,9 @@ def _pictures(
         paths += showcase.draw_compliance(models["compliance"], metrics["compliance"], directory)
     if "grasp" in models:
         paths += showcase.draw_grasp(models["grasp"], config.seed, directory)
+    if config.rerun:
+        for experiment, model in models.items():
+            paths.append(showcase.record(experiment, model, config.seed, directory))
     if config.render:
         for experiment, model in tqdm(models.items(), desc="videos", unit="video"):
             try:

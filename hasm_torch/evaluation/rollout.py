@@ -43,9 +43,10 @@ class Trace:
         velocity: (T, joints) measured joint speeds, rad/s or m/s.
         force: (T,) force that the finger really applied, N.
         patch: (T,) name of the patch pressed, or None.
-        object_height: (T,) height of the object's lower side above the table, m, or NaN.
+        object_height: (T,) height of the object above its place on the table, m.
         success: What the environment said at the end.
         frames: Pictures, if asked for.
+        skin: (T, cells, 3) forces on the skin, N.
     """
 
     time: Array
@@ -57,6 +58,7 @@ class Trace:
     object_height: Array
     success: bool
     frames: list[NDArray[np.uint8]] = field(default_factory=list)
+    skin: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
 
 
 def roll_out(
@@ -87,9 +89,8 @@ def roll_out(
     sim = env.unwrapped
     observation, info = env.reset(seed=seed, options={"joints": joints, "object": object_offset})
     policy.reset()
-    rows: dict[str, list] = {
-        key: [] for key in ("time", "state", "target", "velocity", "force", "patch", "height")
-    }
+    names = ("time", "state", "target", "velocity", "force", "skin", "patch", "height")
+    rows: dict[str, list[Any]] = {name: [] for name in names}
     frames: list[NDArray[np.uint8]] = []
     success = False
     time, state = float(info["time"]), np.asarray(observation["state"], dtype=np.float64)
@@ -103,22 +104,21 @@ def roll_out(
         observation, _, _, truncated, info = env.step(target)
         time, state = float(info["time"]), np.asarray(observation["state"], dtype=np.float64)
         success = bool(info["is_success"])
-        values = (time, state, target, np.array(sim.joint_velocity), info["finger_force"])
-        for key, value in zip(rows, (*values, info["touched"], info.get("object_height"))):
-            rows[key].append(value)
+        motion = (time, state, target, sim.joint_velocity)
+        touch = (info["finger_force"], sim.skin_forces, info["touched"])
+        for name, value in zip(names, (*motion, *touch, info["object_height"])):
+            rows[name].append(value)
         if frame_every and len(rows["time"]) % frame_every == 0:
             frames.append(env.render())
         if truncated:
             break
-    heights = [np.nan if h is None else h for h in rows["height"]]
+    series = {
+        name: np.array(rows[name], dtype=np.float64)
+        for name in ("time", "state", "target", "velocity", "force", "skin")
+    }
+    heights = np.array(rows["height"], dtype=np.float64)
     return Trace(
-        *(np.array(rows[key], dtype=np.float64) for key in ("time", "state", "target")),
-        velocity=np.array(rows["velocity"], dtype=np.float64),
-        force=np.array(rows["force"], dtype=np.float64),
-        patch=rows["patch"],
-        object_height=np.array(heights, dtype=np.float64),
-        success=success,
-        frames=frames,
+        **series, patch=rows["patch"], object_height=heights, success=success, frames=frames
     )
 
 

@@ -12,6 +12,7 @@ from hasm_torch.evaluation.rollout import Array, roll_out
 from hasm_torch.evaluation.runner import make_env, run_case
 from hasm_torch.hasm import HASM
 from hasm_torch.patch_memory import PatchMemory
+from hasm_torch.rerun_recording import Scenes, cell_places, write_recording
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.poses import START_POSES
 from hasm_torch.video import caption, write_video
@@ -96,6 +97,43 @@ def draw_grasp(model: HASM, seed: int, directory: Path) -> list[Path]:
     return [path]
 
 
+def record(experiment: str, model: HASM, seed: int, directory: Path) -> Path:
+    """A recording of one rollout for the Rerun viewer.
+
+    Args:
+        experiment: "compliance" or "grasp".
+        model: The model.
+        seed: Seed of the rollout.
+        directory: Where the recording goes.
+
+    Returns:
+        The recording written.
+    """
+    env = make_env(experiment)
+    spikes: list[Array] = []
+    recalled: list[tuple[str, Array] | None] = []
+
+    def watch(_: Any) -> None:
+        recalled.append(_weights(model))
+        spikes.append(model.rollout.spikes[-1].double().numpy())
+
+    if experiment == "compliance":
+        start = np.array(START_POSES[experiment])
+        trace = roll_out(env, model, _Script(), start, seed, watch=watch)
+    else:
+        case = GraspCase(seed, 2, 0.05, 0.01, 7.0)
+        trace, _ = run_case(experiment, case, env, model, watch=watch)
+    env.close()
+    joints, patches = list(JOINTS), list(model.body.patches)
+    scenes = Scenes(
+        trace.time, joints, trace.state, trace.skin, patches, np.array(spikes), recalled
+    )
+    scenes.cells = cell_places(joints, trace.state)
+    path = directory / f"{experiment}.rrd"
+    write_recording(path, scenes, f"hasm_{experiment}")
+    return path
+
+
 def _weights(model: HASM) -> tuple[str, Array] | None:
     touched = model.touched
     if not touched:
@@ -104,7 +142,8 @@ def _weights(model: HASM) -> tuple[str, Array] | None:
     assert isinstance(memory, PatchMemory)
     positions = model.reference[memory.joints]
     density = model.density[model.body.patches.index(touched[0])]
-    return touched[0], memory.weights(positions, density).double().numpy()
+    link = model.link_rotation(touched[0], model.reference)
+    return touched[0], memory.weights(positions, density, link).double().numpy()
 
 
 def film(experiment: str, model: HASM, seed: int, directory: Path) -> Path:

@@ -47,5 +47,6 @@ def body_of(data: EpisodeSet, urdf: Path | None = None) -> Body:
         patches=[patch.name for patch in patches],
         cells=[patch.cells.stop - patch.cells.start for patch in patches],
         directions=[(n / np.linalg.norm(n)).tolist() for n in normals],
+        links=[patch.link or "" for patch in patches],
         rate=float(data.fps),
     )

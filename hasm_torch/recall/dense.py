@@ -21,7 +21,7 @@ class Recall(NamedTuple):
 
     Attributes:
         decision: d, (..., values).
-        index: Row of the best match, (...,) int64; the first of equals, -1 if no row takes part.
+        match: Row of the best match, (...,) int64; the first of equals, -1 if no row takes part.
         score: Inner product of the query with the best match, (...,).
         margin: How much better the best match scores than the second best, (...,) >= 0;
             infinite if one row takes part.
@@ -29,7 +29,7 @@ class Recall(NamedTuple):
     """
 
     decision: Tensor
-    index: Tensor
+    match: Tensor
     score: Tensor
     margin: Tensor
     entropy: Tensor
@@ -113,9 +113,7 @@ def check_shapes(
         )
 
 
-def exclude(
-    scores: Tensor, batch_dims: int, count: Tensor | None, mask: Tensor | None
-) -> Tensor:
+def exclude(scores: Tensor, batch_dims: int, count: Tensor | None, mask: Tensor | None) -> Tensor:
     """Which rows take no part, broadcastable to the scores (..., rows)."""
     rows = torch.arange(scores.shape[-1], device=scores.device)
     if count is None:
@@ -131,7 +129,9 @@ def summarise(
 ) -> Recall:
     """Decision and statistics from the scores and logits (-inf: takes no part) of every row."""
     weights = torch.softmax(logits, dim=-1)
-    ranked = torch.where(logits > -torch.inf, torch.where(torch.as_tensor(beta) < 0, -scores, scores), -torch.inf)
+    ranked = torch.where(
+        logits > -torch.inf, torch.where(torch.as_tensor(beta) < 0, -scores, scores), -torch.inf
+    )
     best = ranked.argmax(-1, keepdim=True)
     found = ranked.gather(-1, best).squeeze(-1)
     rival = ranked.scatter(-1, best, -torch.inf).amax(-1)

@@ -1,7 +1,9 @@
 """Softmax recall over a memory of ±1 codes, one bit an entry.
 
-Layout: a block holds 64 associations; ``words[block, w, row]`` is word w (32 entries, the first in the
-lowest bit) of association 64·block + row. Entries past the code and rows past the memory are zero.
+Layout: a block holds 64 associations; ``words[block, w, row]`` is word w (32 entries, the first in
+the lowest bit) of association 64·block + row. Rows of a block lie side by side, so that one
+instruction compares the same word of many associations. Entries past the code and rows past the
+memory are zero.
 """
 
 import math
@@ -25,15 +27,12 @@ def pack(codes: Tensor) -> Tensor:
     Returns:
         (..., blocks, words, 64) int32 with blocks = ⌈rows / 64⌉ and words = ⌈dim / 32⌉.
     """
-    rows, dim = codes.shape[-2:]
-    blocks, words = -(-rows // ROWS), -(-dim // WORD)
-    bits = torch.nn.functional.pad(codes >= 0, (0, words * WORD - dim, 0, blocks * ROWS - rows))
-    shifts = torch.arange(WORD, dtype=torch.int32, device=codes.device)
-    parts = [
-        (part.unflatten(-1, (words, WORD)).to(torch.int32) << shifts).sum(-1, dtype=torch.int32)
-        for part in bits.split(max(1, _PACKED_AT_ONCE // (words * WORD)), dim=-2)
-    ]
-    return torch.cat(parts, dim=-2).unflatten(-2, (blocks, ROWS)).mT.contiguous()
+    rows = codes.shape[-2]
+    blocks = -(-rows // ROWS)
+    step = max(1, _PACKED_AT_ONCE // max(1, codes[..., :1, :].numel()))
+    words = torch.cat([_pack_codes(part) for part in codes.split(step, dim=-2)], dim=-2)
+    words = torch.nn.functional.pad(words, (0, 0, 0, blocks * ROWS - rows))
+    return words.unflatten(-2, (blocks, ROWS)).mT.contiguous()
 
 
 def unpack(words: Tensor, dim: int) -> Tensor:
@@ -59,8 +58,7 @@ def store(words: Tensor, rows: Tensor, codes: Tensor) -> None:
         rows: (n,) int64.
         codes: (n, dim); the sign counts.
     """
-    packed = pack(codes).mT.flatten(0, 1)[: len(rows)]
-    words[rows // ROWS, :, rows % ROWS] = packed
+    words[rows // ROWS, :, rows % ROWS] = _pack_codes(codes)
 
 
 def recall_packed(
@@ -106,8 +104,8 @@ def inspect_packed(
     mask: Tensor | None = None,
 ) -> Recall:
     """Recalls like ``recall_packed`` and tells the best match, its margin and the entropy."""
-    decision, index, certainty = _recall(query, words, successors, beta, count, mask)
-    return Recall(decision, index, *certainty.unbind(0))
+    decision, match, certainty = _recall(query, words, successors, beta, count, mask)
+    return Recall(decision, match, *certainty.unbind(0))
 
 
 def _recall(
@@ -118,7 +116,7 @@ def _recall(
     count: Tensor | None,
     mask: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Decision, index, and (score, margin, entropy) stacked: by the operator or, for gradients, torch."""
+    """Decision, match, and score, margin and entropy stacked."""
     batch, (blocks, width) = words.shape[:-3], words.shape[-3:-1]
     rows = successors.shape[-2]
     check_shapes(query, batch, blocks * ROWS, successors, mask)
@@ -127,7 +125,9 @@ def _recall(
             f"expected a query of {WORD * width - WORD + 1} to {WORD * width} entries for "
             f"{width} words a code, got {query.shape[-1]}"
         )
-    beta = torch.as_tensor(beta, dtype=torch.float64 if isinstance(beta, float) else None)
+    if not isinstance(beta, Tensor):
+        exact = torch.float64 if query.device.type == "cpu" else torch.float32
+        beta = torch.full((), beta, dtype=exact, device=query.device)
     if count is None:
         count = torch.full((), rows, dtype=torch.int64, device=query.device)
     learning = torch.is_grad_enabled() and (beta.requires_grad or successors.requires_grad)
@@ -145,10 +145,9 @@ def _recall_by_torch(
     mask: Tensor | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The same recall in torch operations: any device, and gradients for β and the successors."""
-    batch_dims, dim, rows = words.ndim - 3, query.shape[-1], successors.shape[-2]
-    signs = pack(query.reshape(*words.shape[:-3], -1, dim))  # (*batch, blocks_q, width, 64)
-    signs = signs.mT.flatten(-3, -2)[..., : query[..., 0].numel() // max(1, words[..., 0, 0, 0].numel()), :]
-    stored = words.transpose(-3, -2).flatten(-2)  # (*batch, width, 64 * blocks)
+    batch, dim, rows = words.shape[:-3], query.shape[-1], successors.shape[-2]
+    signs = _pack_codes(query).reshape(*batch, -1, words.shape[-2])
+    stored = words.transpose(-3, -2).flatten(-2)
     distances = torch.zeros(
         *signs.shape[:-1], stored.shape[-1], dtype=torch.int32, device=query.device
     )
@@ -157,9 +156,17 @@ def _recall_by_torch(
         distances += _count_ones(differing)
     scores = (dim - 2 * distances)[..., :rows].reshape(*query.shape[:-1], rows)
     scores = scores.to(torch.promote_types(successors.dtype, torch.float32))
-    logits = (beta * scores).masked_fill(exclude(scores, batch_dims, count, mask), -torch.inf)
+    logits = (beta * scores).masked_fill(exclude(scores, len(batch), count, mask), -torch.inf)
     recall = summarise(scores, logits, beta, query, successors)
-    return recall.decision, recall.index, torch.stack(recall[2:])
+    return recall.decision, recall.match, torch.stack(recall[2:])
+
+
+def _pack_codes(codes: Tensor) -> Tensor:
+    """Codes (..., dim) as words (..., words) int32."""
+    words = -(-codes.shape[-1] // WORD)
+    bits = torch.nn.functional.pad(codes >= 0, (0, words * WORD - codes.shape[-1]))
+    shifts = torch.arange(WORD, dtype=torch.int32, device=codes.device)
+    return (bits.unflatten(-1, (words, WORD)) << shifts).sum(-1, dtype=torch.int32)
 
 
 def _count_ones(bits: Tensor) -> Tensor:
@@ -173,7 +180,7 @@ def _count_ones(bits: Tensor) -> Tensor:
 _library = torch.library.Library("hasm_torch", "FRAGMENT")
 _library.define(
     "packed_recall(Tensor query, Tensor words, Tensor successors, Tensor beta, Tensor count, "
-    "Tensor? mask) -> (Tensor decision, Tensor index, Tensor certainty)",
+    "Tensor? mask) -> (Tensor decision, Tensor match, Tensor certainty)",
     tags=(torch.Tag.pt2_compliant_tag,),
 )
 _packed_recall = torch.ops.hasm_torch.packed_recall.default
@@ -206,6 +213,39 @@ def _on_cpu(
     )
 
 
+def _on_gpu(
+    query: Tensor,
+    words: Tensor,
+    successors: Tensor,
+    beta: Tensor,
+    count: Tensor,
+    mask: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    try:
+        from hasm_torch.recall.packed_gpu import scan_gpu
+    except ImportError:  # no Triton on this platform
+        return _recall_by_torch(query, words, successors, beta, count, mask)
+
+    batch, leading = words.shape[:-3], query.shape[:-1]
+    # With a negative beta the farthest row counts; the complement makes it the nearest.
+    signs = _pack_codes(torch.where((query >= 0) == (beta >= 0), 1, -1))
+    with torch.cuda.device(query.device):
+        decision, match, certainty = scan_gpu(
+            signs.reshape(*batch, -1, signs.shape[-1]),
+            words.contiguous(),
+            successors.contiguous(),
+            beta,
+            count.expand(batch).contiguous(),
+            None if mask is None else mask.reshape(*batch, -1, mask.shape[-1]).contiguous(),
+            query.shape[-1],
+        )
+    return (
+        decision.reshape(*leading, -1),
+        match.reshape(leading),
+        certainty.reshape(3, *leading),
+    )
+
+
 def _shapes_only(
     query: Tensor,
     words: Tensor,
@@ -223,5 +263,6 @@ def _shapes_only(
 
 
 _library.impl("packed_recall", _on_cpu, "CPU")
+_library.impl("packed_recall", _on_gpu, "CUDA")
 _library.impl("packed_recall", _recall_by_torch, "CompositeExplicitAutograd")
 torch.library.register_fake("hasm_torch::packed_recall", _shapes_only, lib=_library)

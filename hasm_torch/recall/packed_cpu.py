@@ -1,8 +1,8 @@
 """Runs the packed scan on the CPU, on the threads torch uses.
 
-The compiled functions are called by address. Large memories are scanned by a team of threads: torch's
-own OpenMP team where its runtime is reachable, so that no second pool of threads competes with it, and
-Python threads elsewhere.
+The compiled functions are called by address. Large memories are scanned by a team of threads:
+torch's own OpenMP team where its runtime is reachable, so that no second pool of threads competes
+with it, and Python threads elsewhere.
 """
 
 import ctypes
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-# A team is worth waking when it compares at least so many 32-bit words (about 0.1 ms of one thread).
+# A team is worth waking to compare at least so many 32-bit words, about 0.1 ms of one thread.
 _TEAM_WORDS = 1 << 20
 
 _CPU = torch.device("cpu")
@@ -42,16 +42,18 @@ def _load_kernel() -> _Kernel:
 
     kinds = {"i8": ctypes.c_int64, "f8": ctypes.c_double}
     fields = [(name, kinds[kind]) for name, kind in kernel.JOB_FIELDS]
+    steps = (kernel.begin, kernel.scan, kernel.finish)
+    begin, scan, finish = (int(step.address or 0) for step in steps)
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
     return _Kernel(
-        type("Job", (ctypes.Structure,), {"_fields_": fields}),
-        call(kernel.begin.address),
-        call(kernel.scan.address),
-        kernel.scan.address,
-        call(kernel.finish.address),
-        kernel.state_entries,
-        kernel.BUFFER_ENTRIES,
-        _openmp_team() or _python_team,
+        job=type("Job", (ctypes.Structure,), {"_fields_": fields}),
+        begin=call(begin),
+        scan=call(scan),
+        scan_address=scan,
+        finish=call(finish),
+        state_entries=kernel.state_entries,
+        buffer_entries=kernel.BUFFER_ENTRIES,
+        team=_openmp_team() or _python_team,
     )
 
 
@@ -101,7 +103,7 @@ def scan_cpu(
         mask: (*batch, ..., rows) bool.
 
     Returns:
-        Decision (*batch, ..., values); index of the best match (*batch, ...) int64; its score, its
+        Decision (*batch, ..., values); row of the best match (*batch, ...) int64; its score, its
         margin and the entropy of the weights, (3, *batch, ...).
     """
     kernel = _load_kernel()
@@ -115,14 +117,13 @@ def scan_cpu(
     threads = torch.get_num_threads() if compared >= _TEAM_WORDS else 1
 
     decision = torch.empty(*leading, values, dtype=torch.float32, device=_CPU)
-    index = torch.empty(leading, dtype=torch.int64, device=_CPU)
+    match = torch.empty(leading, dtype=torch.int64, device=_CPU)
     certainty = torch.empty(3, *leading, dtype=torch.float32, device=_CPU)
     if total == 0:
-        return decision, index, certainty
+        return decision, match, certainty
 
-    # Scratch, in float64 entries: packed queries, weight table, states, buffers.
-    table = -(-total * width // 2)
-    states = table + dim + 2
+    # Scratch, in float64 entries: packed queries, states, buffers.
+    states = -(-total * width // 2)
     buffers = states + threads * total * kernel.state_entries(values)
     scratch = torch.empty(
         buffers + threads * kernel.buffer_entries, dtype=torch.float64, device=_CPU
@@ -136,10 +137,9 @@ def scan_cpu(
         counts=count.data_ptr(),
         mask=0 if mask is None else mask.data_ptr(),
         decision=decision.data_ptr(),
-        index=index.data_ptr(),
+        match=match.data_ptr(),
         certainty=certainty.data_ptr(),
         signs=place,
-        table=place + 8 * table,
         states=place + 8 * states,
         buffers=place + 8 * buffers,
         memories=memories,
@@ -158,4 +158,4 @@ def scan_cpu(
     else:
         kernel.team(kernel.scan_address, address, threads)
     kernel.finish(address)
-    return decision, index, certainty
+    return decision, match, certainty

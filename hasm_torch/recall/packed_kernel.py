@@ -1,16 +1,16 @@
 """The scan of a packed memory on a CPU, compiled on first use by numba's LLVM.
 
-A block holds 64 associations, word by word: ``words[block, w, row]``. XOR with the query's word w and a
-population count give 64 partial Hamming distances at once, with no sum across lanes. The softmax is folded
-into the scan. With h the Hamming distance, the inner product of two ±1 codes is s = D - 2h, so the weight
-relative to the best match is exp(-2 beta (h - h_min)): a table with one entry per distance.
+A block holds 64 associations, word by word: ``words[block, w, row]``. XOR with the query's word w
+and a population count give 64 partial Hamming distances at once, with no sum across lanes. The
+softmax is folded into the scan. With h the Hamming distance, the inner product of two ±1 codes is
+s = D - 2h, so the weight relative to the best match is exp(-2 beta (h - h_min)).
 
-The smallest distance seen so far bounds what the rest may weigh: a row farther than ``slack`` above it
-weighs less than NEGLIGIBLE / K, all such rows together less than NEGLIGIBLE of the whole, so blocks whose
-nearest row lies beyond are passed over without reading their successors.
+The smallest distance seen so far bounds what the rest may weigh: a row farther than ``slack`` above
+it weighs less than NEGLIGIBLE / K, all such rows together less than NEGLIGIBLE of the whole, so
+blocks whose nearest row lies beyond are passed over without reading their successors.
 
-Every function takes one pointer, to a job record (JOB_FIELDS), so that a team of threads can run it; the
-threads take the tasks (runs of blocks) from a shared counter.
+Every function takes one pointer, to a job record (JOB_FIELDS), so that a team of threads can run
+it; the threads take the tasks (runs of blocks) from a shared counter.
 """
 
 import math
@@ -20,11 +20,12 @@ from llvmlite import ir
 from numba import carray, cfunc, from_dtype, njit, types
 from numba.extending import intrinsic
 
-from hasm_torch.recall.packed_vector import ROWS, add_weighted_rows, block_distances
+from hasm_torch.recall.packed_vector import ROWS, add_weighted_rows, block_distances, weigh_block
 
 NEGLIGIBLE = 2.0**-40  # weight that may be dropped, relative to the whole
 FAR = 1 << 29  # distance of a row that takes no part
 
+_SHARPEST = 1e4  # beyond it only the nearest rows weigh, in float64
 _CACHED_BYTES = 16_384  # words kept in the first-level cache while the queries go over them
 _TASK_BLOCKS = 64  # at most so many blocks a task
 
@@ -38,12 +39,11 @@ JOB_FIELDS = [
     ("counts", "i8"),  # int64 (memories,): live rows
     ("mask", "i8"),  # bool (memories, queries, rows), or 0
     ("decision", "i8"),  # out, float32 (memories, queries, values)
-    ("index", "i8"),  # out, int64 (memories, queries)
+    ("match", "i8"),  # out, int64 (memories, queries)
     ("certainty", "i8"),  # out, float32 (3, memories, queries): score, margin, entropy
     ("signs", "i8"),  # scratch, int32 (memories, queries, width): the packed queries
-    ("table", "i8"),  # scratch, float64 (dim + 2,): weight at each distance above the nearest
     ("states", "i8"),  # scratch, float64 (threads, memories * queries, 5 + values)
-    ("buffers", "i8"),  # scratch, float64 (threads, 96): 64 distances and 64 weights
+    ("buffers", "i8"),  # scratch, 4 bytes (threads, 128): 64 distances and 64 weights
     ("memories", "i8"),
     ("queries", "i8"),
     ("dim", "i8"),
@@ -55,9 +55,12 @@ JOB_FIELDS = [
     ("tasks", "i8"),  # set by begin
     ("run", "i8"),  # set by begin: blocks a task
     ("beta", "f8"),
+    ("sharpness", "f8"),  # set by begin: weight exp(-sharpness * distance)
 ]
-BUFFER_ENTRIES = ROWS // 2 + ROWS  # of one thread, in float64
-_STATE = 5  # nearest distance, its row, second distance, sum of weights, sum of weight * distance
+BUFFER_ENTRIES = ROWS  # of one thread, in float64
+# Nearest distance, its row, second distance, sum of weights, sum of weights times the distance
+# above the nearest; then the weighted successors.
+_STATE = 5
 _JOB = types.CPointer(from_dtype(np.dtype(JOB_FIELDS)))
 _I64 = ir.IntType(64)
 
@@ -107,14 +110,13 @@ def begin(job_pointer):
     job = carray(job_pointer, 1)[0]
     width = (job.dim + 31) // 32
     queries = job.memories * job.queries
-    sharpness = 2.0 * abs(job.beta)
 
     source, signs = _float32s(job.query), _int32s(job.signs)
     for query in range(queries):
         for word in range(width):
             bits = np.uint32(0)
             for bit in range(min(32, job.dim - 32 * word)):
-                # For a negative beta the farthest row counts: the complement turns it into the nearest.
+                # With a negative beta the farthest row counts; the complement makes it nearest.
                 positive = source[query * job.dim + 32 * word + bit] >= 0
                 bits |= np.uint32(positive != (job.beta < 0)) << np.uint32(bit)
             signs[query * width + word] = np.int32(bits)
@@ -123,15 +125,10 @@ def begin(job_pointer):
     live = 0
     for memory in range(job.memories):
         live = max(live, min(counts[memory], job.rows))
+    job.sharpness = min(2.0 * abs(job.beta), _SHARPEST)
     # exp(-sharpness * (slack + 1)) <= NEGLIGIBLE / K
     reach = math.log(max(live, 1) / NEGLIGIBLE)
-    job.slack = job.dim if reach >= sharpness * job.dim else int(reach / sharpness)
-    table = _float64s(job.table)
-    table[0] = 1.0
-    for distance in range(1, job.slack + 1):
-        table[distance] = math.exp(-sharpness * distance)
-    table[job.slack + 1] = 0.0
-
+    job.slack = int(min(reach / job.sharpness, job.dim)) if job.sharpness > 0 else job.dim
     states = _float64s(job.states)
     size = _state_entries(job.values)
     for entry in range(job.threads * queries * size):
@@ -146,14 +143,12 @@ def begin(job_pointer):
     job.tasks = job.memories * ((blocks + job.run - 1) // job.run)
 
 
-@njit(fastmath={"reassoc"}, cache=True)
-def _absorb(job, memory, first_row, count, closest, state_address, buffer):
+@njit(cache=True)
+def _absorb(job, memory, first_row, count, closest, state_address, distances_address):
     """Adds a block whose distances are known to the running sums of a query."""
-    state = _float64s(state_address)
-    distances, weights = _int32s(buffer), _float64s(buffer + 4 * ROWS)
-    nearest, second = int(state[0]), int(state[2])
-    if closest < second:
-        before = nearest
+    state, distances = _float64s(state_address), _int32s(distances_address)
+    if closest < state[2]:
+        before, nearest, second = int(state[0]), int(state[0]), int(state[2])
         for row in range(ROWS):
             distance = distances[row]
             if distance < nearest:
@@ -162,20 +157,22 @@ def _absorb(job, memory, first_row, count, closest, state_address, buffer):
             elif distance < second:
                 second = distance
         state[0], state[2] = nearest, second
-        scale = _float64s(job.table)[min(before - nearest, job.slack + 1)]
-        for entry in range(3, _STATE + job.values):
-            state[entry] *= scale
+        scale = math.exp(-job.sharpness * (before - nearest))
+        state[4] = (state[4] + (before - nearest) * state[3]) * scale
+        state[3] *= scale
+        for value in range(job.values):
+            state[_STATE + value] *= scale
 
-    # A weight per distance; beyond the slack, and for rows left out, it is the table's last, zero.
-    table, last = _float64s(job.table), job.slack + 1
-    for row in range(ROWS):
-        weights[row] = table[min(distances[row] - nearest, last)]
-    total, moment = 0.0, 0.0
-    for row in range(ROWS):
-        total += weights[row]
-        moment += weights[row] * distances[row]
-    state[3] += total
-    state[4] += moment
+    weights_address = distances_address + 4 * ROWS
+    added: tuple[float, float] = weigh_block(  # type: ignore[call-arg]
+        distances_address,
+        int(state[0]),
+        job.slack + 1,
+        job.sharpness / math.log(2.0),
+        weights_address,
+    )
+    state[3] += added[0]
+    state[4] += added[1]
 
     rows = min(ROWS, count - first_row)
     fours = rows // 4 * 4
@@ -183,14 +180,14 @@ def _absorb(job, memory, first_row, count, closest, state_address, buffer):
     if fours > 0:
         for value in range(0, job.values, 8):
             add_weighted_rows(
-                buffer + 4 * ROWS,
+                weights_address,
                 job.successors + 4 * (first + value),
                 fours,
                 job.values,
                 job.values - value,
                 state_address + 8 * (_STATE + value),
             )
-    successors = _float32s(job.successors)
+    weights, successors = _float32s(weights_address), _float32s(job.successors)
     for row in range(fours, rows):
         for value in range(job.values):
             state[_STATE + value] += weights[row] * successors[first + row * job.values + value]
@@ -198,7 +195,7 @@ def _absorb(job, memory, first_row, count, closest, state_address, buffer):
 
 @njit(cache=True)
 def _keep_live(job, memory, query, first_row, count, distances):
-    """Puts the rows of a block that take no part out of reach; returns the smallest distance left."""
+    """Puts rows that take no part out of reach; returns the smallest distance left."""
     mask = _bytes(job.mask)
     offset = (memory * job.queries + query) * job.rows + first_row
     nearest = FAR
@@ -211,9 +208,9 @@ def _keep_live(job, memory, query, first_row, count, distances):
 
 @cfunc(types.void(_JOB), cache=True)
 def scan(job_pointer):
-    """One thread's part: takes tasks until none is left, with a state of its own for every query."""
+    """One thread's part: tasks until none is left, with a state of its own for every query."""
     job = carray(job_pointer, 1)[0]
-    slot = _take(job_pointer, 1)
+    slot: int = _take(job_pointer, 1)  # type: ignore[call-arg]
     width = (job.dim + 31) // 32
     size = _state_entries(job.values)
     own_states = job.states + 8 * slot * job.memories * job.queries * size
@@ -255,9 +252,8 @@ def finish(job_pointer):
     job = carray(job_pointer, 1)[0]
     size = _state_entries(job.values)
     queries = job.memories * job.queries
-    sharpness = 2.0 * abs(job.beta)
     states = _float64s(job.states)
-    decision, index = _float32s(job.decision), _int64s(job.index)
+    decision, match = _float32s(job.decision), _int64s(job.match)
     score = _float32s(job.certainty)
     margin = _float32s(job.certainty + 4 * queries)
     entropy = _float32s(job.certainty + 8 * queries)
@@ -274,7 +270,7 @@ def finish(job_pointer):
                 second = min(second, distance)
             second = min(second, int(states[state + 2]))
         if nearest == FAR:
-            index[query] = -1
+            match[query] = -1
             score[query] = margin[query] = entropy[query] = math.nan
             for value in range(job.values):
                 decision[query * job.values + value] = math.nan
@@ -285,16 +281,15 @@ def finish(job_pointer):
         for thread in range(job.threads):
             state = (thread * queries + query) * size
             farther = states[state] - nearest
-            scale = math.exp(-sharpness * farther) if farther > 0 else 1.0
+            scale = math.exp(-job.sharpness * farther)
             total += scale * states[state + 3]
-            moment += scale * states[state + 4]
+            moment += scale * (states[state + 4] + farther * states[state + 3])
             for value in range(job.values):
                 gathered = states[sums + value] if thread > 0 else 0.0
                 states[sums + value] = gathered + scale * states[state + _STATE + value]
         for value in range(job.values):
             decision[query * job.values + value] = states[sums + value] / total
-        index[query] = row
+        match[query] = row
         score[query] = (job.dim - 2 * nearest) * (-1 if job.beta < 0 else 1)
         margin[query] = 2 * (second - nearest) if second < FAR else math.inf
-        spread = moment / total - nearest  # mean distance above the nearest
-        entropy[query] = math.log(total) + (sharpness * spread if spread > 0 else 0.0)
+        entropy[query] = math.log(total) + job.sharpness * moment / total

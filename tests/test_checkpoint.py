@@ -1,0 +1,195 @@
+"""A saved model is the same model, and a damaged file is no model."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from toys import make_body, record, smooth_path, spell
+
+from hasm_torch import HASM, HASMConfig
+
+BODY = make_body(3)
+PATH = smooth_path(BODY, 200, 0, [0, 1])
+
+
+def fitted(config: HASMConfig | None = None) -> HASM:
+    model = HASM(config or HASMConfig(), BODY)
+    model.fit([record(BODY, "front", PATH, 6.0), record(BODY, "back", PATH[::-1], 6.0)])
+    return model
+
+
+@pytest.fixture
+def saved(tmp_path):
+    fitted().save_pretrained(tmp_path / "model")
+    return tmp_path / "model"
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        HASMConfig(),
+        HASMConfig(storage="int8"),
+        HASMConfig(storage="bfloat16"),
+        HASMConfig(storage="float32", rebinarise=False),
+        HASMConfig.literal(),
+    ],
+    ids=["bit", "int8", "bfloat16", "float32", "literal"],
+)
+def test_a_loaded_model_takes_identical_steps(tmp_path, config):
+    model = fitted(config)
+    model.save_pretrained(tmp_path / "deep" / "model")
+    loaded = HASM.from_pretrained(tmp_path / "deep" / "model")
+    assert loaded.config == model.config
+    assert loaded.body == model.body
+    assert loaded.shapes == model.shapes
+    start = torch.tensor(PATH[20], dtype=torch.float32)
+    series = []
+    for robot in (model, loaded):
+        robot.reset()
+        there = spell(robot, BODY, start, "front", 7.0, 60)
+        series.append(torch.cat([there, spell(robot, BODY, there[-1], "back", 3.0, 40)]))
+    assert torch.equal(*series)
+    assert len(torch.unique(series[0][:, 0])) > 20  # it did move
+    assert loaded.memory_bytes() == model.memory_bytes()
+
+
+def test_saving_again_replaces_the_model(saved):
+    model = HASM(HASMConfig(neurons=6), BODY)
+    model.fit([record(BODY, "side", PATH, 6.0)])
+    model.save_pretrained(saved)
+    loaded = HASM.from_pretrained(saved)
+    assert list(loaded.memories) == ["side"]
+    assert loaded.config.neurons == 6
+    assert not list(saved.glob("*.partial"))
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_a_missing_file_is_named(saved, name):
+    (saved / name).unlink()
+    with pytest.raises(FileNotFoundError, match=f"no {name} in checkpoint"):
+        HASM.from_pretrained(saved)
+
+
+def test_a_missing_directory_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        HASM.from_pretrained(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+def test_a_truncated_file_is_no_model(saved, name, share):
+    content = (saved / name).read_bytes()
+    (saved / name).write_bytes(content[: int(share * len(content))])
+    with pytest.raises(ValueError, match=r"checkpoint .* is damaged"):
+        HASM.from_pretrained(saved)
+
+
+def test_a_config_of_other_bytes_is_no_model(saved):
+    (saved / "config.json").write_bytes(b"\xff\xfe\x00 not text")
+    with pytest.raises(ValueError, match="is damaged"):
+        HASM.from_pretrained(saved)
+
+
+def edit_settings(content):
+    content["model"]["bits"] = 8
+
+
+def drop_section(content):
+    del content["memories"]
+
+
+def unknown_setting(content):
+    content["model"]["colour"] = "red"
+
+
+def wrong_type(content):
+    content["model"]["neurons"] = "ten"
+
+
+def unknown_choice(content):
+    content["model"]["storage"] = "paper"
+
+
+def unknown_patch(content):
+    content["memories"]["tail"] = content["memories"].pop("front")
+
+
+def foreign_joint(content):
+    content["memories"]["front"]["joints"] = [0, 17]
+
+
+def other_capacity(content):
+    content["memories"]["front"]["capacity"] += 1
+
+
+def no_memory(content):
+    content["memories"] = {}
+
+
+def list_of_memories(content):
+    content["memories"] = ["front"]
+
+
+def fewer_limits(content):
+    content["body"]["lower"].pop()
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        edit_settings,
+        drop_section,
+        unknown_setting,
+        wrong_type,
+        unknown_choice,
+        unknown_patch,
+        foreign_joint,
+        other_capacity,
+        no_memory,
+        list_of_memories,
+        fewer_limits,
+    ],
+)
+def test_an_edited_config_does_not_load(saved, edit):
+    content = json.loads((saved / "config.json").read_text())
+    edit(content)
+    (saved / "config.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"checkpoint .*train"):
+        HASM.from_pretrained(saved)
+
+
+def test_a_config_that_is_no_object_does_not_load(saved):
+    (saved / "config.json").write_text("[1, 2]")
+    with pytest.raises(ValueError, match="is damaged"):
+        HASM.from_pretrained(saved)
+
+
+def test_weights_with_a_missing_or_strange_entry_do_not_load(saved):
+    weights = load_file(saved / "model.safetensors")
+    for name in list(weights):
+        changed = {k: v for k, v in weights.items() if k != name}
+        save_file(changed, saved / "model.safetensors")
+        with pytest.raises(ValueError, match="is damaged"):
+            HASM.from_pretrained(saved)
+    save_file({**weights, "more": torch.zeros(2)}, saved / "model.safetensors")
+    with pytest.raises(ValueError, match="is damaged"):
+        HASM.from_pretrained(saved)
+
+
+def test_weights_that_are_not_finite_do_not_load(saved):
+    weights = load_file(saved / "model.safetensors")
+    name = next(name for name in weights if name.endswith("successors"))
+    weights[name][3, 0] = float("nan")
+    save_file(weights, saved / "model.safetensors")
+    with pytest.raises(ValueError, match=r"successors holds NaN"):
+        HASM.from_pretrained(saved)
+
+
+def test_memories_that_are_not_full_do_not_load(saved):
+    weights = load_file(saved / "model.safetensors")
+    name = next(name for name in weights if name.endswith("memory.count"))
+    for count in (0, int(weights[name]) + 1, -1):
+        save_file({**weights, name: torch.tensor(count)}, saved / "model.safetensors")
+        with pytest.raises(ValueError, match="holds"):
+            HASM.from_pretrained(saved)

@@ -1,0 +1,87 @@
+"""The Triton kernels against the CPU's scan: on a GPU, and in Triton's interpreter without one."""
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+import torch
+
+from hasm_torch.recall import Recall, inspect_packed, pack
+
+# (batch, rows, dim, queries, values, beta, masked)
+CASES = [
+    ((), 1, 1, 1, 1, 1.0, False),
+    ((), 70, 33, 3, 5, 0.1, True),
+    ((2,), 700, 200, 2, 8, 3.0, True),
+    ((3,), 300, 64, 2, 3, -0.05, False),
+    ((), 600, 40, 2, 3, 0.0, False),
+    ((), 600, 31, 2, 9, 50.0, True),
+    ((), 600, 31, 2, 9, float("inf"), False),
+]
+
+
+def draw(batch, rows, dim, queries, values, beta, masked):
+    generator = torch.Generator().manual_seed(rows + dim)
+    codes, query = (
+        torch.randint(0, 2, (*batch, n, dim), generator=generator) * 2.0 - 1.0
+        for n in (rows, queries)
+    )
+    mask = None
+    if masked:
+        mask = torch.rand(*batch, queries, rows, generator=generator) < 0.5
+        mask[..., 0, :] = False
+    return (
+        query,
+        pack(codes),
+        torch.randn(*batch, rows, values, generator=generator),
+        torch.tensor(beta),
+        torch.randint(1, rows + 1, batch, generator=generator),
+        mask,
+    )
+
+
+def assert_same(found, expected):
+    for left, right in zip(found, expected, strict=True):
+        torch.testing.assert_close(left.cpu(), right, atol=1e-5, rtol=1e-5, equal_nan=True)
+
+
+def compare_interpreted():
+    from hasm_torch.recall.packed import _pack_codes
+    from hasm_torch.recall.packed_gpu import scan_gpu
+
+    for case in CASES:
+        query, *memory = draw(*case)
+        signs = _pack_codes(-query if case[5] < 0 else query)
+        decision, match, certainty = scan_gpu(signs, *memory, dim=query.shape[-1])
+        assert_same(Recall(decision, match, *certainty), inspect_packed(query, *memory))
+
+
+@pytest.mark.skipif(find_spec("triton") is None, reason="needs Triton")
+def test_interpreted_kernels_agree_with_the_cpu():
+    environment = {**os.environ, "TRITON_INTERPRET": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    ran = subprocess.run(
+        [sys.executable, __file__], env=environment, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("case", CASES)
+def test_the_gpu_agrees_with_the_cpu(case):
+    arguments = draw(*case)
+    moved = [None if part is None else part.cuda() for part in arguments]
+    assert_same(inspect_packed(*moved), inspect_packed(*arguments))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_large_memory_on_the_gpu():
+    arguments = draw((), 200_001, 400, 40, 8, 0.2, False)
+    assert_same(
+        inspect_packed(*(part.cuda() for part in arguments[:-1])), inspect_packed(*arguments)
+    )
+
+
+if __name__ == "__main__":
+    compare_interpreted()
