@@ -3,16 +3,22 @@
 The reference is the joint state that the robot is asked to take. A spike of a touched patch moves
 it along the straight segment to the recalled successor by 1/pace of a joint range; at the
 successor the next one is recalled. Without spikes nothing moves, so the robot holds still.
+
+A control step handles a few numbers at a time, which NumPy does in float64 and a fraction of the
+time that tensors take.
 """
 
 from collections import deque
 from dataclasses import dataclass, field
 
-import torch
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hasm_torch.patch_memory import PatchMemory
 from hasm_torch.skin_encoder import SkinState
+
+Array = NDArray[np.float64]
 
 # A walk that needs more recalls than this in one control step waits for the next one, which
 # bounds the time a step takes.
@@ -31,7 +37,7 @@ class Goal:
         pace: Spikes a full joint range.
     """
 
-    positions: Tensor
+    positions: Array
     pace: float
 
 
@@ -45,7 +51,7 @@ class Walk:
         quiet: Control steps since each patch last spiked.
     """
 
-    reference: Tensor | None = None
+    reference: Array | None = None
     goals: dict[str, Goal] = field(default_factory=dict)
     quiet: dict[str, int] = field(default_factory=dict)
 
@@ -62,22 +68,22 @@ class Rollout:
         walk: Where the robot is in the memories.
     """
 
-    spikes: deque[Tensor]
-    density: Tensor
+    spikes: deque[Array]
+    density: Array
     touched: list[str] = field(default_factory=list)
     skin: SkinState | None = None
     walk: Walk = field(default_factory=Walk)
 
 
 def advance(
-    reference: Tensor,
+    reference: Array,
     walk: Walk,
     patch: str,
     memory: PatchMemory,
     spikes: float,
-    density: Tensor,
+    density: float,
     link: Tensor | None = None,
-) -> Tensor:
+) -> Array:
     """Move the reference by a number of spikes of one patch.
 
     Args:
@@ -86,21 +92,19 @@ def advance(
         patch: Name of the patch.
         memory: The patch's memory.
         spikes: Spikes to spend.
-        density: () rate density ρ of the patch.
+        density: Rate density ρ of the patch.
         link: (3, 3) rotation of the patch's link, see ``PatchMemory.codes``.
 
     Returns:
         (joints,) the moved reference; joints that the memory does not code stay.
     """
-    coded = reference[memory.joints]
-    span = memory.place_code.upper - memory.place_code.lower
+    coded = reference[memory.coded]
     for _ in range(RECALLS_A_STEP):
         goal = walk.goals.get(patch)
         if goal is None:
-            positions, pace = memory(coded, density, link)
-            goal = walk.goals[patch] = Goal(positions, float(pace))
+            goal = walk.goals[patch] = Goal(*memory.follow(coded, density, link))
         way = goal.positions - coded
-        needed = goal.pace * float((way / span).abs().max())
+        needed = goal.pace * float(np.abs(way / memory.span).max())
         if needed > spikes:
             coded = coded + way * (spikes / needed)
             break
@@ -108,22 +112,23 @@ def advance(
         del walk.goals[patch]
         if needed == 0 or spikes == 0:
             break
-    moved = reference.clone()
-    moved[memory.joints] = coded
+    moved = reference.copy()
+    moved[memory.coded] = coded
     return moved
 
 
-def limit_speed(before: Tensor, after: Tensor, max_speed: Tensor, period: float) -> Tensor:
+def limit_speed(before: Array, after: Array, max_speed: Array, period: float) -> Array:
     """Shorten a step, keeping its direction, so that no joint is asked to exceed its speed limit.
 
     Args:
-        before: (..., joints) positions now, rad or m.
-        after: (..., joints) positions wanted a control step later, rad or m.
+        before: (joints,) positions now, rad or m.
+        after: (joints,) positions wanted a control step later, rad or m.
         max_speed: (joints,) speed limits, rad/s or m/s.
         period: Duration of a control step, s.
 
     Returns:
-        (..., joints) positions that the limits allow.
+        (joints,) positions that the limits allow.
     """
-    share = ((after - before).abs() / (SPEED_SHARE * max_speed * period)).amax(-1, keepdim=True)
-    return before + (after - before) / torch.clamp(share, min=1.0)
+    way = after - before
+    share = float((np.abs(way) / (SPEED_SHARE * period * max_speed)).max())
+    return after if share <= 1.0 else before + way / share

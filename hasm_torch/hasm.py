@@ -10,12 +10,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hasm_torch import checkpoint
 from hasm_torch.config import Body, HASMConfig, MemoryShape
-from hasm_torch.control import Rollout, Walk, advance, limit_speed
+from hasm_torch.control import Array, Rollout, Walk, advance, limit_speed
 from hasm_torch.learning import FitReport, Recording, learn
 from hasm_torch.patch_memory import PatchMemory
 from hasm_torch.skin_encoder import SkinEncoder
@@ -55,7 +56,7 @@ class HASM(nn.Module):
     ) -> None:
         super().__init__()
         self.config, self.body = config, body
-        self._kinematics: "Kinematics | None" = None
+        self._kinematics: Kinematics | None = None
         self.skin = SkinEncoder(
             body.cells,
             body.rate,
@@ -71,6 +72,11 @@ class HASM(nn.Module):
         self.register_buffer("lower", torch.tensor(body.lower, dtype=torch.float32))
         self.register_buffer("upper", torch.tensor(body.upper, dtype=torch.float32))
         self.register_buffer("max_speed", torch.tensor(body.max_speed, dtype=torch.float32))
+        # As the float32 that targets are given in, so that none is rounded across a limit.
+        self._lower, self._upper, self._max_speed = (
+            np.array(limit, dtype=np.float32).astype(np.float64)
+            for limit in (body.lower, body.upper, body.max_speed)
+        )
         self.register_buffer("tolerance", 0.1 * (self.upper - self.lower))
         self.reset()
 
@@ -140,7 +146,7 @@ class HASM(nn.Module):
     def new_rollout(self) -> Rollout:
         """A control loop at its beginning, for ``step``."""
         window = max(1, round(self.config.rate_window_s * self.body.rate))
-        return Rollout(deque(maxlen=window), self.lower.new_zeros(len(self.body.patches)))
+        return Rollout(deque(maxlen=window), np.zeros(len(self.body.patches)))
 
     @torch.no_grad()
     def step(self, state: Tensor, skin: Tensor, rollout: Rollout | None = None) -> Tensor:
@@ -160,35 +166,36 @@ class HASM(nn.Module):
             RuntimeError: If the model has learned nothing, or the very first joint reading is
                 not finite, so that there is nothing to hold.
         """
-        state, skin = self._checked(state, skin)
-        readable = bool(torch.isfinite(state).all() & torch.isfinite(skin).all())
+        measured, skin = self._checked(state, skin)
         rollout = self.rollout if rollout is None else rollout
         walk = rollout.walk
+        known = bool(np.isfinite(measured).all())
         if walk.reference is None:
-            if not bool(torch.isfinite(state).all()):
+            if not known:
                 raise RuntimeError("no finite joint reading yet, so there is no position to hold")
-            walk.reference = torch.clamp(state, self.lower, self.upper)
-        if not readable:
+            walk.reference = np.clip(measured, self._lower, self._upper)
+        if not (known and bool(torch.isfinite(skin).all())):
             rollout.touched = []
-            return walk.reference.clone()
-        counts, _, rollout.skin = self.skin(skin.unsqueeze(0), rollout.skin)
-        rollout.spikes.append(counts[0])
+            return self._target(walk.reference, state)
+        spikes, _, rollout.skin = self.skin(skin.unsqueeze(0), rollout.skin)
+        counts = spikes[0].cpu().numpy().astype(np.float64)
+        rollout.spikes.append(counts)
         rollout.density = density = self._density(rollout.spikes)
         rollout.touched = touched = [
             patch
-            for patch, count in zip(self.body.patches, counts[0].tolist())
+            for patch, count in zip(self.body.patches, counts)
             if count > 0 and patch in self.memories
         ]
-        self._note_onsets(walk, touched, state)
+        self._note_onsets(walk, touched, measured)
         target = walk.reference
         for patch in touched:
             index = self.body.patches.index(patch)
-            spikes = float(counts[0, index])
-            target = self._move(walk, target, patch, spikes, density[index], state)
+            felt = (float(counts[index]), float(density[index]))
+            target = self._move(walk, target, patch, *felt, measured)
         if touched:
-            target = limit_speed(walk.reference, target, self.max_speed, 1.0 / self.body.rate)
-            walk.reference = torch.clamp(target, self.lower, self.upper)
-        return walk.reference.clone()
+            target = limit_speed(walk.reference, target, self._max_speed, 1.0 / self.body.rate)
+            walk.reference = np.clip(target, self._lower, self._upper)
+        return self._target(walk.reference, state)
 
     @property
     def touched(self) -> list[str]:
@@ -198,7 +205,7 @@ class HASM(nn.Module):
     @property
     def density(self) -> Tensor:
         """(patches,) rate density ρ of every patch at the last step."""
-        return self.rollout.density
+        return torch.from_numpy(self.rollout.density).float()
 
     @property
     def reference(self) -> Tensor:
@@ -209,38 +216,38 @@ class HASM(nn.Module):
         """
         if self.rollout.walk.reference is None:
             raise RuntimeError("no step was made since the reset, so there is no reference yet")
-        return self.rollout.walk.reference
+        return torch.from_numpy(self.rollout.walk.reference).float()
 
     def _move(
         self,
         walk: Walk,
-        reference: Tensor,
+        reference: Array,
         patch: str,
         spikes: float,
-        density: Tensor,
-        state: Tensor,
-    ) -> Tensor:
+        density: float,
+        measured: Array,
+    ) -> Array:
         memory = self.memory(patch)
         if self.config.advance == "tick":
-            moved = reference.clone()
-            link = self.link_rotation(patch, state)
-            moved[memory.joints] = memory(state[memory.joints], density, link)[0]
+            link = self.link_rotation(patch, torch.from_numpy(measured))
+            moved = reference.copy()
+            moved[memory.coded], _ = memory.follow(measured[memory.coded], density, link)
             return moved
-        lag = (state - reference).abs()[memory.joints]
-        if bool((lag > self.tolerance[memory.joints]).any()):
+        lag = np.abs(measured - reference)[memory.coded]
+        if (lag > self.tolerance.cpu().numpy()[memory.coded]).any():
             return reference  # the joints are held up: wait for them
-        link = self.link_rotation(patch, reference)
+        link = self.link_rotation(patch, torch.from_numpy(reference))
         return advance(reference, walk, patch, memory, spikes, density, link)
 
-    def _note_onsets(self, walk: Walk, touched: list[str], state: Tensor) -> None:
+    def _note_onsets(self, walk: Walk, touched: list[str], measured: Array) -> None:
         """Where a new touch begins, take up joints that were moved meanwhile."""
         assert walk.reference is not None
         onset = ONSET_AFTER * self.body.rate
         if any(walk.quiet.get(patch, onset) >= onset for patch in touched):
-            away = (state - walk.reference).abs() > self.tolerance
-            if bool(away.any()):
-                held = torch.clamp(state, self.lower, self.upper)
-                walk.reference = torch.where(away, held, walk.reference)
+            away = np.abs(measured - walk.reference) > self.tolerance.cpu().numpy()
+            if away.any():
+                held = np.clip(measured, self._lower, self._upper)
+                walk.reference = np.where(away, held, walk.reference)
                 walk.goals.clear()
         for patch in list(walk.goals):
             if touched and patch not in touched:
@@ -248,23 +255,26 @@ class HASM(nn.Module):
         for patch in self.memories:
             walk.quiet[patch] = 0 if patch in touched else walk.quiet.get(patch, 0) + 1
 
-    def _density(self, spikes: deque[Tensor]) -> Tensor:
+    def _density(self, spikes: deque[Array]) -> Array:
         """Rate density ρ of every patch over the last window, (patches,)."""
-        window = spikes.maxlen or 1
-        rate = torch.stack(list(spikes)).sum(0) * (self.body.rate / window)
-        return torch.clamp(rate / self.config.max_rate, 0.0, 1.0)
+        seconds = (spikes.maxlen or 1) / self.body.rate
+        return np.clip(np.sum(spikes, axis=0) / (seconds * self.config.max_rate), 0.0, 1.0)
 
-    def _checked(self, state: Tensor, skin: Tensor) -> tuple[Tensor, Tensor]:
+    def _checked(self, state: Tensor, skin: Tensor) -> tuple[Array, Tensor]:
         if not self.memories:
             raise RuntimeError("the model has learned nothing: call fit or from_pretrained first")
         joints, cells = len(self.body.joints), sum(self.body.cells)
         if state.shape != (joints,):
             raise ValueError(f"expected state ({joints},), got {tuple(state.shape)}")
-        if skin.ndim == 1 and len(skin) and len(skin) % cells == 0:
-            skin = skin.reshape(cells, -1)
-        if skin.ndim != 2 or len(skin) != cells:
-            raise ValueError(f"expected skin ({cells}, points) or flat, got {tuple(skin.shape)}")
-        return state.to(self.lower), skin.to(self.lower)
+        if skin.shape == (3 * cells,):
+            skin = skin.reshape(cells, 3)
+        if skin.shape != (cells, 3):
+            raise ValueError(f"expected skin ({cells}, 3) or flat, got {tuple(skin.shape)}")
+        return state.detach().cpu().numpy().astype(np.float64), skin.to(self.lower)
+
+    def _target(self, reference: Array, state: Tensor) -> Tensor:
+        """The reference as the caller takes it, float32 on the device of the state."""
+        return torch.from_numpy(reference.astype(np.float32)).to(state.device)
 
     def memory_bytes(self) -> int:
         """Bytes of all associations and successors held."""

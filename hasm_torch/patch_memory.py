@@ -4,7 +4,9 @@ joints ── PlaceCode ──► s ┐
 ρ ── TactileEmbedding ──► F ── RoPE3D ──► o ┤ HeteroAssociativeMemory ──► successor, pace
 """
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hasm_torch.bipolar import binarise
@@ -24,7 +26,8 @@ class PatchMemory(nn.Module):
     force repeats the recorded speed.
 
     Attributes:
-        joints: (J,) indices of the joints that are coded.
+        joints: (J,) indices of the joints that are coded; ``coded`` holds them as an array.
+        span: (J,) array, their ranges, rad or m.
         touch_levels: (L,) stored rate densities ρ; a query is moved to the nearest of them.
         direction: (3,) outward normal of the patch in the frame of its link.
         axis: (3,) rotation axis of the touch in that frame.
@@ -62,6 +65,8 @@ class PatchMemory(nn.Module):
             count * config.neurons * config.bits, count + 1, shape.capacity, storage=config.storage
         )
         self.register_buffer("joints", torch.tensor(shape.joints, dtype=torch.int64))
+        self.coded = np.array(shape.joints)
+        self.span = np.array([body.upper[j] - body.lower[j] for j in shape.joints])
         self.register_buffer("touch_levels", torch.zeros(shape.touch_levels))
         direction = torch.tensor(body.directions[patch], dtype=torch.float32)
         self.register_buffer("direction", direction, persistent=False)
@@ -137,6 +142,15 @@ class PatchMemory(nn.Module):
         """
         decision = self.memory(*self.codes(positions, density, link))
         return decision[..., :-1], decision[..., -1]
+
+    def follow(
+        self, positions: NDArray[np.float64], density: float, link: Tensor | None = None
+    ) -> tuple[NDArray[np.float64], float]:
+        """``forward`` of one query in arrays, for the control loop: (J,) positions and pace."""
+        query = torch.from_numpy(positions.astype(np.float32)).to(self.joints.device)
+        level = torch.tensor(density, dtype=torch.float32, device=self.joints.device)
+        decision = self.memory(*self.codes(query, level, link)).cpu().numpy().astype(np.float64)
+        return decision[:-1], float(decision[-1])
 
     def weights(self, positions: Tensor, density: Tensor, link: Tensor | None = None) -> Tensor:
         """Softmax weight of every stored association; arguments as in ``forward``.

@@ -30,8 +30,10 @@ def block_rotations(dim: int, axis: Tensor, angle: Tensor) -> Tensor:
         (blocks, 3, 3), float32 or better.
     """
     blocks = dim // 3
-    basis = torch.eye(3, dtype=axis.dtype, device=axis.device).repeat(1, blocks)
-    turned = rope3d(basis, axis, angle)  # row k: the images of the k-th unit vector in all blocks
+    # Row k holds the k-th unit vector in all blocks, and the code's whole length, on which the
+    # frequencies depend.
+    basis = torch.eye(3, dtype=axis.dtype, device=axis.device).repeat(1, blocks + 1)[:, :dim]
+    turned = rope3d(basis, axis, angle)[:, : 3 * blocks]
     return turned.reshape(3, blocks, 3).permute(1, 2, 0).contiguous()
 
 
@@ -57,13 +59,13 @@ def encode_query(
     _compiled()(
         rows.numpy(),
         density.detach().float().expand(leading).reshape(-1).contiguous().numpy(),
-        coder.lower.float().numpy(),
-        coder.upper.float().numpy(),
+        coder.lower.numpy(),
+        coder.upper.numpy(),
         coder.neurons,
         coder.bits,
         coder.width,
         CODES.index(coder.code),
-        rotations.float().numpy(),
+        rotations.numpy(),
         rebinarise,
         state,
         touch,
@@ -105,10 +107,7 @@ def _compiled() -> Callable[..., None]:
                     counts[level] += 1
                     word = level ^ (level >> 1) if code == gray else level
                     for bit in range(bits):
-                        if code == thermometer:
-                            on = level > bit
-                        else:
-                            on = (word >> (bits - 1 - bit)) & 1 == 1
+                        on = level > bit if code == thermometer else word >> bits - 1 - bit & 1 == 1
                         state[row, index * bits + bit] = 1.0 if on else -1.0
             # N = round(ρ N_n N_J) most active neurons; of equal ones those of lower index
             wanted = int(np.rint(density[row] * np.float32(total)))

@@ -115,7 +115,7 @@ def record(experiment: str, model: HASM, seed: int, directory: Path) -> Path:
 
     def watch(_: Any) -> None:
         recalled.append(_weights(model))
-        spikes.append(model.rollout.spikes[-1].double().numpy())
+        spikes.append(model.rollout.spikes[-1])
 
     if experiment == "compliance":
         start = np.array(START_POSES[experiment])

@@ -2,6 +2,8 @@
 
     batch ──episode_index──► episodes shown so far ──read whole, in order──► HASM.fit
     observation.state, observation.tactile ──HASM.step, one rollout a robot──► action
+
+Whichever way a model was trained, `checkpoint` says how it lies on disk.
 """
 
 import hashlib
@@ -45,8 +47,8 @@ class HASMPolicy(PreTrainedPolicy):
         ValueError: If neither dataset nor checkpoint says what the body is, or the two differ.
     """
 
-    config_class = HASMConfig  # type: ignore[assignment]
-    name = "hasm"  # type: ignore[assignment]
+    config_class = HASMConfig
+    name = "hasm"
     config: HASMConfig
 
     def __init__(

@@ -73,8 +73,8 @@ def recall_packed(
 
         d = S₋₁ softmax(β Mᵀ q),   mᵀq = dim - 2·popcount(m xor q)
 
-    Exact for ±1 codes and every β: what is left out weighs less than 2⁻⁴⁰ of the whole, which moves
-    the decision by less than 2⁻³⁹ of the largest successor. The query is binarised by sign, so no
+    No association is approximated: scores are exact integers, weights are float32 and what is left
+    out weighs less than 2⁻⁴⁰ of the whole, for every β. The query is binarised by sign, so no
     gradient reaches it; gradients reach β and the successors.
 
     Args:
@@ -227,6 +227,7 @@ def _on_gpu(
         return _recall_by_torch(query, words, successors, beta, count, mask)
 
     batch, leading = words.shape[:-3], query.shape[:-1]
+    beta = beta.to(query.device)
     # With a negative beta the farthest row counts; the complement makes it the nearest.
     signs = _pack_codes(torch.where((query >= 0) == (beta >= 0), 1, -1))
     with torch.cuda.device(query.device):

@@ -106,7 +106,7 @@ _state_entries = njit(cache=True)(state_entries)
 
 @cfunc(types.void(_JOB), cache=True)
 def begin(job_pointer):
-    """Packs the queries, tabulates the weights, clears the states, cuts the memory into tasks."""
+    """Packs the queries, bounds what weighs, clears the states, cuts the memory into tasks."""
     job = carray(job_pointer, 1)[0]
     width = (job.dim + 31) // 32
     queries = job.memories * job.queries

@@ -1,0 +1,1 @@
+"""Measurements that are reproduced by ``python -m benchmarks.<name>``."""

@@ -1,0 +1,201 @@
+"""The figures of the grasp experiment and the human who guides it."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hasm_torch.evaluation.grasp import (
+    GRASP_PATCH,
+    LIFT_NOISE_SHARE,
+    REACH_PATCH,
+    STALLED_AFTER,
+    TIME_LIMIT,
+    GraspCase,
+    Guide,
+    cases,
+    noisy_start,
+    run_case,
+    summarise,
+)
+from hasm_torch.evaluation.rollout import roll_out
+
+PERIOD = 0.02
+LOWER, UPPER = np.full(3, -1.0), np.full(3, 1.0)
+
+
+def guided(guide: Guide, speed: float, seconds: float = TIME_LIMIT + 5, stuck_after: float = 1.0):
+    """A robot that moves for `stuck_after` seconds of each patch's touch; what was touched."""
+    state, seen, moved = np.zeros(3), [], {REACH_PATCH: 0.0, GRASP_PATCH: 0.0}
+    for step in range(round(seconds / PERIOD)):
+        time = step * PERIOD
+        if guide.finished(time, state):
+            break
+        patch, force = guide.touch(time, state)
+        seen.append((time, patch, force))
+        if patch is not None and moved[patch] < stuck_after:
+            moved[patch] += PERIOD
+            state = state + speed * PERIOD
+    return seen
+
+
+def test_a_guide_reaches_then_grasps_then_is_done():
+    guide = Guide(7.0, 0, np.random.default_rng(0))
+    seen = guided(guide, speed=0.5)
+    patches = [patch for _, patch, _ in seen if patch is not None]
+    assert patches == sorted(patches, key=[REACH_PATCH, GRASP_PATCH].index)
+    assert {force for _, patch, force in seen if patch} == {7.0}
+    for patch in (REACH_PATCH, GRASP_PATCH):
+        touched = PERIOD * patches.count(patch)
+        assert touched == pytest.approx(1.0 + STALLED_AFTER, abs=0.2)
+    assert len(guide.pauses) == 2  # once after each stage
+    assert seen[-1][0] < 12.0
+
+
+def test_a_guide_leaves_at_random_moments_and_comes_back():
+    guide = Guide(7.0, 3, np.random.default_rng(1))
+    seen = guided(guide, speed=0.2, stuck_after=6.0)
+    assert len(guide.pauses) == 3 + 2
+    for begin, end in guide.pauses:
+        assert {patch for time, patch, _ in seen if begin <= time < end - 1e-9} == {None}
+    lengths = [end - begin for begin, end in guide.pauses]
+    assert sum(0.8 <= length <= 1.6 for length in lengths) == 3
+    again = Guide(7.0, 3, np.random.default_rng(1))
+    assert guided(again, speed=0.2, stuck_after=6.0) == seen
+
+
+def test_a_guide_goes_on_after_a_pause_where_it_was():
+    """A pause does not count as the robot's standing still."""
+    guide = Guide(7.0, 0, np.random.default_rng(0))
+    guide.moments, guide.lengths = [0.5], [10.0]
+    seen = guided(guide, speed=0.5)
+    after = [patch for time, patch, _ in seen if time > guide.pauses[0][1]]
+    assert after[0] == REACH_PATCH
+
+
+def test_patience_ends():
+    guide = Guide(7.0, 0, np.random.default_rng(0))
+    seen = guided(guide, speed=0.5, stuck_after=1e9)
+    assert seen[-1][0] == pytest.approx(TIME_LIMIT, abs=2 * PERIOD)
+
+
+def test_start_noise_has_its_size_and_keeps_the_limits():
+    rng = np.random.default_rng(0)
+    starts = np.array([noisy_start(np.zeros(3), 0.05, LOWER, UPPER, rng) for _ in range(2000)])
+    np.testing.assert_allclose(starts.std(axis=0), 0.05 * np.array([LIFT_NOISE_SHARE, 1, 1]), 0.1)
+    wild = np.array([noisy_start(np.zeros(3), 50.0, LOWER, UPPER, rng) for _ in range(50)])
+    assert (wild >= LOWER).all()
+    assert (wild <= UPPER).all()
+    np.testing.assert_array_equal(noisy_start(UPPER, 0.0, LOWER, UPPER, rng), UPPER)
+
+
+def test_cases_are_planned_from_the_seed():
+    planned = cases(5, [4.0, 8.0], 1, pauses=2, start_noise=0.1, object_noise=0.01)
+    assert planned == cases(5, [4.0, 8.0], 1, 2, 0.1, 0.01)
+    assert [case.force for case in planned] == [4.0, 8.0, 4.0, 8.0, 4.0]
+    assert len({case.seed for case in planned}) == 5
+    assert [case.force for case in cases(2, [], 1, 2, 0.1, 0.01)] == [None, None]
+
+
+class Table:
+    """A robot of three joints that reaches each target at once; the object rises with joint 0."""
+
+    joint_lower, joint_upper = LOWER, UPPER
+    joint_speed_limit = np.full(3, 100.0)
+    skin_forces = np.zeros((1, 3))
+
+    def __init__(self, drift: float = 0.0, lift: float = 0.1, success: bool = True) -> None:
+        self.unwrapped, self.drift, self.lift, self.success = self, drift, lift, success
+
+    def reset(self, seed, options):
+        self.steps, self.state, self.patch = 0, np.array(options["joints"]), None
+        self.offset = options["object"]
+        return self.observe(), {"time": 0.0}
+
+    def touch(self, patch, force):
+        self.patch, self.force = patch, force
+
+    def step(self, target):
+        self.steps += 1
+        before, self.state = self.state, np.clip(target + self.drift, LOWER, UPPER)
+        self.joint_velocity = (self.state - before) / PERIOD
+        info = {
+            "time": self.steps * PERIOD,
+            "is_success": self.success,
+            "finger_force": self.force if self.patch else 0.0,
+            "touched": self.patch,
+            "object_height": self.lift,
+        }
+        return self.observe(), 0.0, False, False, info
+
+    def observe(self):
+        return {"state": self.state.astype(np.float32), "tactile": np.zeros(3, np.float32)}
+
+
+class Holder:
+    """A policy that asks for the joints as they are."""
+
+    def reset(self):
+        self.resets = getattr(self, "resets", 0) + 1
+
+    def step(self, state, skin):
+        return state.clone()
+
+
+CASE = GraspCase(seed=3, pauses=2, start_noise=0.05, object_noise=0.01, force=6.0)
+
+
+def test_a_robot_that_holds_still_does_not_drift():
+    policy = Holder()
+    trace, found = run_case(CASE, Table(), policy, np.zeros(3))
+    assert found["success"]
+    assert found["hold_drift"] == 0.0
+    assert found["force"] == 6.0
+    assert found["violations"] == 0
+    assert policy.resets == 1
+    assert set(trace.patch) == {None, REACH_PATCH, GRASP_PATCH}
+
+
+def test_a_robot_that_moves_in_a_pause_drifts():
+    trace, found = run_case(CASE, Table(drift=1e-4), Holder(), np.zeros(3))
+    longest = max(
+        np.ptp(trace.time[(trace.time >= a + 0.3) & (trace.time <= b)]) for a, b in pauses_of(trace)
+    )
+    assert found["hold_drift"] == pytest.approx(1e-4 * longest / PERIOD, rel=0.1)
+
+
+def pauses_of(trace):
+    """Spells without touch after the first touch, as (begin, end)."""
+    free = np.array([patch is None for patch in trace.patch])
+    edges = np.flatnonzero(np.diff(free.astype(int)))
+    times = trace.time[edges]
+    spans = zip(times[1::2], [*times[2::2], trace.time[-1]])
+    return [(begin, end) for begin, end in spans if end - begin > 0.4]
+
+
+def test_success_needs_the_environment_and_the_height():
+    assert not run_case(CASE, Table(lift=0.04), Holder(), np.zeros(3))[1]["success"]
+    assert not run_case(CASE, Table(success=False), Holder(), np.zeros(3))[1]["success"]
+
+
+def test_a_rollout_hands_on_what_the_case_says():
+    table = Table()
+    human = SimpleNamespace(touch=lambda t, s: (None, 0.0), finished=lambda t, s: t >= 0.1)
+    seen = []
+    trace = roll_out(table, Holder(), human, np.array([0.1, 0.2, 0.3]), 0, (0.004, -0.003),
+                     watch=seen.append)  # fmt: skip
+    assert table.offset == (0.004, -0.003)
+    np.testing.assert_allclose(trace.state, np.tile([0.1, 0.2, 0.3], (5, 1)), atol=1e-7)
+    np.testing.assert_allclose(trace.time, PERIOD * np.arange(1, 6))
+    assert len(seen) == 5
+
+
+def test_figures_of_many_grasps_are_put_together():
+    one = {"success": True, "hold_drift": 0.001, "violations": 0, "seconds": 10.0}
+    two = {"success": False, "hold_drift": 0.004, "violations": 2, "seconds": 20.0}
+    summary = summarise([one, one, one, two])
+    assert summary["rollouts"] == 4
+    assert summary["success_rate"] == 0.75
+    assert summary["hold_drift_rad"] == 0.004
+    assert summary["limit_violations"] == 2
+    assert summary["mean_seconds"] == 12.5
