@@ -1,5 +1,6 @@
 """Storing episodes: from recordings to the associations of every patch."""
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -23,12 +24,12 @@ LEVEL_GAP = 0.06
 # The reference waits for a joint that lags this many times more than it ever did in the episodes.
 LAG_FACTOR = 2.0
 
-# Largest error of a recalled successor that ``fit`` accepts, as a share of the joint range.
-RECALL_ERROR = 1e-4
+# A recalled successor that is off by more than this share of the joint range is worth a warning.
+RECALL_ERROR = 1e-3
 
 
 class Recording(Protocol):
-    """One episode: time (T,) s; state, action (T, J) rad or m; tactile (T, cells, points) N."""
+    """One episode: time (T,) s; state, action (T, J) rad or m; tactile (T, cells, 3) N."""
 
     time: Any
     state: Any
@@ -174,7 +175,7 @@ def spike_series(model: "HASM", skin: Tensor) -> tuple[Tensor, Tensor]:
 
     Args:
         model: Encodes the skin.
-        skin: (T, cells, points), N.
+        skin: (T, cells, 3), N.
 
     Returns:
         Spikes in each sample period and rate density ρ, both (T, patches).
@@ -240,6 +241,12 @@ def _store(
     memory.memory.beta.fill_(beta)
     recalled, _ = memory(positions[source], density[source], link)
     error = ((recalled - positions[target]).abs() / span).max()
+    if config.store == "distinct" and error > RECALL_ERROR:
+        warnings.warn(
+            f"{patch}: a recalled successor is off by {float(error):.1%} of the joint range, so the "
+            f"recall may miss stored states; raise beta (now {beta:.3g}) or resolution",
+            stacklevel=2,
+        )
     report.associations[patch] = len(source)
     report.joints[patch] = [body.joints[j] for j in joints]
     report.betas[patch] = beta

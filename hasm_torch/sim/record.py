@@ -48,8 +48,8 @@ def main() -> None:
         title="HSR pseudo-compliance by touch",
         summary=(
             "A simulated Toyota HSR with robot skin yields to a finger: touch on the upper or "
-            "under side of the wrist moves the arm down or up, touch on its left or right side turns the "
-            "wrist. Each episode covers the whole range of one joint."
+            "under side of the wrist moves the arm down or up, touch on its left or right side "
+            "turns the wrist. Each episode covers the whole range of one joint."
         ),
         recording=(
             f"MuJoCo simulation, {CONTROL_RATE} Hz. Every behaviour is shown once with each of "

@@ -1,0 +1,47 @@
+"""Skin readings of any layout as the forces of cells.
+
+A cell gives three normal forces (the paper's skin), one pressure, or a wrench (fx, fy, fz, tx, ty,
+tz). A pressure is the first of three forces. A wrench becomes six cells, one a direction +x, -x,
++y, -y, +z, -z of its sensor, each with the force that pushes that way, so that direction and
+strength reach the memory as those of six patches; its torques are left aside.
+"""
+
+import torch
+from torch import Tensor
+
+FORCES, PRESSURE, WRENCH = 3, 1, 6
+DIRECTIONS = {
+    "+x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "+y": (0.0, 1.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "+z": (0.0, 0.0, 1.0),
+    "-z": (0.0, 0.0, -1.0),
+}
+
+
+def as_forces(readings: Tensor) -> Tensor:
+    """Readings as forces.
+
+    Args:
+        readings: (..., cells, channels) with 3, 1 or 6 channels.
+
+    Returns:
+        (..., cells, 3), or (..., 6 · cells, 3) for wrenches, in the order of ``DIRECTIONS`` for
+        each cell.
+
+    Raises:
+        ValueError: If a cell has another number of channels.
+    """
+    channels = readings.shape[-1] if readings.ndim else 0
+    if channels == FORCES:
+        return readings
+    if channels == PRESSURE:
+        return torch.nn.functional.pad(readings, (0, FORCES - PRESSURE))
+    if channels != WRENCH:
+        raise ValueError(
+            f"expected 3 forces, 1 pressure or a wrench of 6 a cell, got {tuple(readings.shape)}"
+        )
+    force = readings[..., :3]
+    pushes = torch.stack([force.clamp(min=0), (-force).clamp(min=0)], dim=-1).flatten(-2)
+    return torch.nn.functional.pad(pushes.flatten(-2).unsqueeze(-1), (0, FORCES - PRESSURE))
