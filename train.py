@@ -18,7 +18,8 @@ def main() -> None:
             "--dataset.root=datasets/hsr_compliance --output_dir=outputs/train/compliance"
         )
     try:
-        trained = train(config.dataset.root, settings(config.method, config.model))
+        method = settings(config.method, config.model)
+        trained = train(config.dataset.root, method, config.features, config.robot)
         trained.model.save_pretrained(config.output_dir)
     except (OSError, ValueError) as error:
         sys.exit(f"train.py: {error}")

@@ -122,11 +122,10 @@ def load_weights(model: "HASM", directory: Path) -> None:
 
 def features(body: Body) -> tuple[dict[str, Any], dict[str, Any]]:
     """What a policy for a body observes and commands, as LeRobot declares it."""
-    joints, forces = len(body.joints), POINTS * sum(body.cells)
-    observations = {
-        STATE: {"type": "STATE", "shape": [joints]},
-        TACTILE: {"type": "STATE", "shape": [forces]},
-    }
+    joints = len(body.joints)
+    observations = {STATE: {"type": "STATE", "shape": [joints]}}
+    if body.channels:
+        observations[TACTILE] = {"type": "STATE", "shape": [body.readings]}
     return observations, {ACTION: {"type": "ACTION", "shape": [joints]}}
 
 

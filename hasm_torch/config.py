@@ -20,6 +20,9 @@ class Body:
         directions: Outward normal of each patch in the frame of the link that carries it.
         links: Name of the link that carries each patch; needed for the base frame only.
         rate: Control and sampling rate, Hz.
+        channels: Readings of a cell in the tactile vector: 3 forces, 1 pressure, or a wrench of 6,
+            whose sensor then counts as six patches of one cell, one a direction (see
+            ``readings``); 0 is a robot without skin, whose one patch is touched all the time.
     """
 
     joints: list[str]
@@ -31,8 +34,16 @@ class Body:
     directions: list[list[float]] = field(default_factory=list)
     links: list[str] = field(default_factory=list)
     rate: float = 50.0
+    channels: int = 3
+
+    @property
+    def readings(self) -> int:
+        """Length of the tactile vector."""
+        return sum(self.cells) * {0: 0, 3: 3}.get(self.channels, 1)
 
     def __post_init__(self) -> None:
+        if self.channels not in (0, 1, 3, 6):
+            raise ValueError(f"channels must be 0, 1, 3 or 6 readings a cell, got {self.channels}")
         sizes = {
             "lower": len(self.lower),
             "upper": len(self.upper),

@@ -3,11 +3,12 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-# More rows than this are judged by a sample of so many, each against all others.
-SAMPLED_ROWS = 4096
+# Multiplications spent on matches; where all pairs would take more, fewer rows are judged.
+LARGEST_WORK = 1e11
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,8 @@ def crowding(associations: Tensor, capacity: int, confidence: float = 1e6) -> Cr
         confidence: Ratio of the right weight to all others together.
 
     Returns:
-        The report; with more than 4,096 associations margin and crosstalk come from an evenly
-        spread sample of that many.
+        The report; of many long associations margin and crosstalk come from an evenly spread
+        sample, each judged against all others.
 
     Raises:
         ValueError: If there is no association, or the confidence is not above 0.
@@ -60,9 +61,9 @@ def crowding(associations: Tensor, capacity: int, confidence: float = 1e6) -> Cr
     if not confidence > 0:
         raise ValueError(f"confidence must be above 0, got {confidence}")
     held = len(associations)
-    stored = torch.unique(associations.float(), dim=0)
+    stored = associations[_distinct(associations)].float()
     own = (stored**2).sum(-1)
-    step = max(1, len(stored) // SAMPLED_ROWS)
+    step = max(1, math.ceil(len(stored) ** 2 * stored.shape[1] / LARGEST_WORK))
     rows = torch.arange(0, len(stored), step, device=stored.device)
     rival = torch.cat([_best_rival(stored, part) for part in rows.split(512)])
     lead = own[rows] - rival
@@ -71,6 +72,14 @@ def crowding(associations: Tensor, capacity: int, confidence: float = 1e6) -> Cr
     crosstalk = 0.0 if alone else float((rival / own[rows]).mean())
     beta = math.log(max(confidence * max(len(stored) - 1, 1), math.e)) / max(margin, 1e-6)
     return Crowding(held, capacity, held - len(stored), margin, crosstalk, beta)
+
+
+def _distinct(rows: Tensor) -> Tensor:
+    """Indices of the first of each group of equal rows, ascending."""
+    values = np.ascontiguousarray(rows.detach().float().cpu().numpy())
+    whole = values.view(np.dtype((np.void, values.strides[0]))).ravel()
+    _, first = np.unique(whole, return_index=True)
+    return torch.from_numpy(np.sort(first)).to(rows.device)
 
 
 def _best_rival(stored: Tensor, rows: Tensor) -> Tensor:

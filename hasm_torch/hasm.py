@@ -19,7 +19,8 @@ from hasm_torch.config import Body, HASMConfig, MemoryShape
 from hasm_torch.control import Array, Rollout, Walk, advance, limit_speed
 from hasm_torch.learning import FitReport, Recording, learn
 from hasm_torch.patch_memory import PatchMemory
-from hasm_torch.skin_encoder import SkinEncoder
+from hasm_torch.readings import forces_of
+from hasm_torch.skin_encoder import SkinEncoder, spike_step
 
 if TYPE_CHECKING:
     from hasm_torch.robot import Kinematics
@@ -63,7 +64,7 @@ class HASM(nn.Module):
             config.threshold,
             config.force_window,
             config.current_per_newton,
-            config.spike_dt_ms,
+            spike_step(body.rate, config.spike_dt_ms),
         )
         self.shapes: dict[str, MemoryShape] = {}
         self.memories = nn.ModuleDict()
@@ -149,12 +150,15 @@ class HASM(nn.Module):
         return Rollout(deque(maxlen=window), np.zeros(len(self.body.patches)))
 
     @torch.no_grad()
-    def step(self, state: Tensor, skin: Tensor, rollout: Rollout | None = None) -> Tensor:
+    def step(
+        self, state: Tensor, skin: Tensor | None, rollout: Rollout | None = None
+    ) -> Tensor:
         """One control step.
 
         Args:
             state: (joints,) measured joint positions, rad or m.
-            skin: (cells, points) or flat, force of every point of the skin, N.
+            skin: (cells, channels) or flat, the skin's readings in the body's layout; None for a
+                robot without skin.
             rollout: The control loop to go on with, one a robot; by default the model's own.
 
         Returns:
@@ -166,7 +170,7 @@ class HASM(nn.Module):
             RuntimeError: If the model has learned nothing, or the very first joint reading is
                 not finite, so that there is nothing to hold.
         """
-        measured, skin = self._checked(state, skin)
+        measured, forces = self._checked(state, skin)
         rollout = self.rollout if rollout is None else rollout
         walk = rollout.walk
         known = bool(np.isfinite(measured).all())
@@ -174,10 +178,10 @@ class HASM(nn.Module):
             if not known:
                 raise RuntimeError("no finite joint reading yet, so there is no position to hold")
             walk.reference = np.clip(measured, self._lower, self._upper)
-        if not (known and bool(torch.isfinite(skin).all())):
+        if not (known and bool(torch.isfinite(forces).all())):
             rollout.touched = []
             return self._target(walk.reference, state)
-        spikes, _, rollout.skin = self.skin(skin.unsqueeze(0), rollout.skin)
+        spikes, _, rollout.skin = self.skin(forces.unsqueeze(0), rollout.skin)
         counts = spikes[0].cpu().numpy().astype(np.float64)
         rollout.spikes.append(counts)
         rollout.density = density = self._density(rollout.spikes)
@@ -260,17 +264,14 @@ class HASM(nn.Module):
         seconds = (spikes.maxlen or 1) / self.body.rate
         return np.clip(np.sum(spikes, axis=0) / (seconds * self.config.max_rate), 0.0, 1.0)
 
-    def _checked(self, state: Tensor, skin: Tensor) -> tuple[Array, Tensor]:
+    def _checked(self, state: Tensor, skin: Tensor | None) -> tuple[Array, Tensor]:
         if not self.memories:
             raise RuntimeError("the model has learned nothing: call fit or from_pretrained first")
-        joints, cells = len(self.body.joints), sum(self.body.cells)
+        joints = len(self.body.joints)
         if state.shape != (joints,):
             raise ValueError(f"expected state ({joints},), got {tuple(state.shape)}")
-        if skin.shape == (3 * cells,):
-            skin = skin.reshape(cells, 3)
-        if skin.shape != (cells, 3):
-            raise ValueError(f"expected skin ({cells}, 3) or flat, got {tuple(skin.shape)}")
-        return state.detach().cpu().numpy().astype(np.float64), skin.to(self.lower)
+        forces = forces_of(self.body, skin).to(self.lower)
+        return state.detach().cpu().numpy().astype(np.float64), forces
 
     def _target(self, reference: Array, state: Tensor) -> Tensor:
         """The reference as the caller takes it, float32 on the device of the state."""

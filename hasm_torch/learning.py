@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from hasm_torch.config import MemoryShape
+from hasm_torch.readings import forces_of
 from hasm_torch.successors import distinct_links, shifted_links
 from hasm_torch.touch import pair_with_spikes
 
@@ -26,6 +27,9 @@ LAG_FACTOR = 2.0
 
 # A recalled successor that is off by more than this share of the joint range is worth a warning.
 RECALL_ERROR = 1e-3
+
+# Recalled successors that ``fit`` checks in each memory, evenly spread over it.
+CHECKED_RECALLS = 4096
 
 
 class Recording(Protocol):
@@ -60,8 +64,9 @@ class FitReport:
         associations: Associations held, by patch.
         joints: Names of the joints that each patch moves.
         betas: Inverse temperature of each patch's memory.
-        recall_errors: Largest error of a recalled successor at its own association, as a share
-            of the joint range, by patch. Where it is small, recall visits every stored state.
+        recall_errors: Largest error of a recalled successor at its own association (of at most
+            4,096 in each memory), as a share of the joint range, by patch. Where it is small,
+            recall visits every stored state.
     """
 
     episodes: int
@@ -146,9 +151,10 @@ def _positions(model: "HASM", episode: Recording, index: int) -> tuple[Tensor, T
 def _touches(model: "HASM", episode: Recording, state: Tensor, action: Tensor) -> dict[str, Chain]:
     """The chain of every patch that spiked in an episode."""
     config, body = model.config, model.body
-    if episode.tactile is None:
+    if episode.tactile is None and body.channels:
         raise ValueError("an episode has no tactile series, so there is no touch to learn from")
-    skin = torch.as_tensor(episode.tactile, dtype=torch.float32)
+    tactile = None if episode.tactile is None else torch.as_tensor(episode.tactile).float()
+    skin = forces_of(body, tactile, (len(state),))
     if len(skin) != len(state) or len(episode.time) != len(state):
         raise ValueError(
             f"expected time and tactile of {len(state)} samples like the state, got "
@@ -239,12 +245,14 @@ def _store(
     memory.write(positions[source], density[source], positions[target], paces, link)
     beta = config.beta if config.beta is not None else memory.memory.crowding().beta
     memory.memory.beta.fill_(beta)
-    recalled, _ = memory(positions[source], density[source], link)
-    error = ((recalled - positions[target]).abs() / span).max()
+    checked = torch.arange(0, len(source), -(-len(source) // CHECKED_RECALLS))
+    at, to = source[checked], target[checked]
+    recalled, _ = memory(positions[at], density[at], None if link is None else link[checked])
+    error = ((recalled - positions[to]).abs() / span).max()
     if config.store == "distinct" and error > RECALL_ERROR:
         warnings.warn(
-            f"{patch}: a recalled successor is off by {float(error):.1%} of the joint range, so the "
-            f"recall may miss stored states; raise beta (now {beta:.3g}) or resolution",
+            f"{patch}: a recalled successor is off by {float(error):.1%} of the joint range, so "
+            f"the recall may miss stored states; raise beta (now {beta:.3g}) or resolution",
             stacklevel=2,
         )
     report.associations[patch] = len(source)

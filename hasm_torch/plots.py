@@ -123,6 +123,37 @@ def plot_recall(
     _save(figure, path)
 
 
+def plot_prediction(
+    path: Path,
+    frames: Array,
+    real: Array,
+    predicted: dict[str, Array],
+    joints: list[tuple[str, str]],
+    title: str,
+) -> None:
+    """Predicted and real joint positions through some episodes, a panel a joint.
+
+    Args:
+        path: PNG to write.
+        frames: (T,) s; NaN between episodes breaks the lines.
+        real: (T, joints) what came, in the joints' units.
+        predicted: (T, joints) what was predicted, by the name of who predicted it.
+        joints: Name and unit of every joint to draw.
+        title: Heading.
+    """
+    figure, axes = plt.subplots(len(joints), 1, sharex=True, figsize=(9, 1.8 * len(joints)))
+    for j, (axis, (name, unit)) in enumerate(zip(np.atleast_1d(axes), joints)):
+        axis.plot(frames, real[:, j], color="black", linewidth=1.5, label="real")
+        for (who, values), colour in zip(predicted.items(), ("tab:orange", "tab:blue")):
+            axis.plot(frames, values[:, j], color=colour, linewidth=1.0, label=who)
+        axis.set_ylabel(f"{name}\n({unit})", fontsize=8)
+        axis.grid(alpha=0.3)
+    np.atleast_1d(axes)[0].set_title(title)
+    np.atleast_1d(axes)[0].legend(loc="best", fontsize=8)
+    np.atleast_1d(axes)[-1].set_xlabel("time (s), held-out episodes one after the other")
+    _save(figure, path)
+
+
 def _shade(axis: Any, time: Array, patches: list[str | None]) -> None:
     start = 0
     for i in range(1, len(patches) + 1):

@@ -6,6 +6,7 @@ and the Izhikevich neuron of the patch turns I into spikes. Source: section "Neu
 of External Forces" of the paper.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -13,6 +14,25 @@ from torch import Tensor, nn
 
 from hasm_torch.izhikevich import Izhikevich, IzhikevichState
 from hasm_torch.touch import cell_excess
+
+
+def spike_step(rate: float, longest_ms: float) -> float:
+    """The longest integration step up to ``longest_ms`` that divides the sample period.
+
+    Args:
+        rate: Sampling rate, Hz.
+        longest_ms: Longest step, ms.
+
+    Returns:
+        The step, ms: ``longest_ms`` itself where it divides the period.
+    """
+    if not (rate > 0 and longest_ms > 0):
+        raise ValueError(f"expected rate and step above 0, got {rate} Hz and {longest_ms} ms")
+    period = 1000.0 / rate
+    steps = period / longest_ms
+    if abs(steps - round(steps)) <= 1e-6:
+        return longest_ms
+    return period / math.ceil(steps)
 
 
 class SkinState(NamedTuple):

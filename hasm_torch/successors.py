@@ -104,13 +104,21 @@ def distinct_links(codes: Tensor, episodes: Tensor, resolution: int = 1) -> Dist
 
 
 class _Walk:
-    """The growing set of distinct codes and the links between them."""
+    """The growing set of distinct codes and the links between them.
+
+    Two codes that differ in fewer than ``resolution`` entries agree in at least one of as many
+    parts, so only known codes that share a part with a sample need to be compared with it.
+    """
 
     def __init__(self, bits: np.ndarray, resolution: int) -> None:
         padding = -bits.shape[1] % 8
         self.words = np.pad(bits, ((0, 0), (0, padding))).view(np.uint64)
         self.keys = np.empty_like(self.words)
         self.resolution = resolution
+        size = self.words.shape[1] * 8
+        # With fewer bytes than parts some parts would be empty, and then all codes share them.
+        self.borders = [size * i // resolution for i in range(resolution + 1)]
+        self.sharing: list[dict[bytes, list[int]]] = [{} for _ in range(resolution)]
         self.representative: list[int] = []
         self.successor: list[int] = []
         self.left: list[int] = []
@@ -147,12 +155,18 @@ class _Walk:
             distance = int(np.bitwise_count(self.keys[current] ^ word).sum())
             if distance < self.resolution:
                 return current
-        count = len(self.representative)
-        if count:
-            distances = np.bitwise_count(self.keys[:count] ^ word).sum(axis=1)
+        whole = word.tobytes()
+        parts = [whole[a:b] for a, b in pairwise(self.borders)]
+        near = {key for part, known in zip(parts, self.sharing) for key in known.get(part, ())}
+        if near:
+            candidates = np.array(sorted(near))
+            distances = np.bitwise_count(self.keys[candidates] ^ word).sum(axis=1)
             nearest = int(distances.argmin())
             if distances[nearest] < self.resolution:
-                return nearest
+                return int(candidates[nearest])
+        count = len(self.representative)
+        for part, known in zip(parts, self.sharing):
+            known.setdefault(part, []).append(count)
         self.keys[count] = word
         self.representative.append(sample)
         self.successor.append(count)

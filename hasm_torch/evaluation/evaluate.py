@@ -19,7 +19,7 @@ from hasm_torch.evaluation.runner import EXPERIMENTS, check_experiments, run_cas
 from hasm_torch.hasm import HASM
 from hasm_torch.robot import JOINTS, Skin
 from hasm_torch.sim.env import LARGEST_FORCE
-from hasm_torch.training import settings, train
+from hasm_torch.training import DatasetConfig, FeaturesConfig, RobotConfig, settings, train
 
 ROLLOUTS = {"compliance": 40, "grasp": 100}
 TIMED_STEPS = 2000
@@ -30,6 +30,14 @@ class EvalConfig:
     """Options of ``eval.py``.
 
     Attributes:
+        mode: "rollout" in simulation, or "open_loop" prediction of a dataset's held-out episodes,
+            which takes ``dataset``, ``features``, ``robot``, ``folds``, ``horizon_s``, ``method``,
+            ``seed`` and ``output_dir`` and nothing else.
+        dataset: Dataset of open-loop prediction.
+        features: Which of its features are read.
+        robot: Which robot recorded it.
+        folds: Parts into which its episodes are split; each is predicted by the others.
+        horizon_s: How far ahead it is predicted, s, beside one frame ahead.
         checkpoint: Directory written by ``train.py``, rolled out in every experiment named;
             without it a model a experiment is trained on the bundled episodes.
         experiments: "compliance", "grasp" or both.
@@ -45,9 +53,16 @@ class EvalConfig:
         pauses: Random pauses in a grasp.
         render: Whether to make videos.
         rerun: Whether to write a recording of a rollout for the Rerun viewer.
-        output_dir: Where results go; by default ``outputs/eval/<time>``.
+        output_dir: Where results go; by default ``outputs/eval/<time>``, or
+            ``outputs/open_loop/<time>``.
     """
 
+    mode: Literal["rollout", "open_loop"] = "rollout"
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    features: FeaturesConfig = field(default_factory=FeaturesConfig)
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    folds: int = 5
+    horizon_s: float = 0.5
     checkpoint: Path | None = None
     experiments: list[str] = field(default_factory=lambda: list(EXPERIMENTS))
     datasets: Path = Path("datasets")
@@ -64,6 +79,13 @@ class EvalConfig:
     output_dir: Path | None = None
 
     def __post_init__(self) -> None:
+        if self.mode not in ("rollout", "open_loop"):
+            raise ValueError(f"unknown mode {self.mode!r}, valid: rollout, open_loop")
+        if self.mode == "rollout" and self.dataset.root is not None:
+            raise ValueError(
+                "a rollout takes --checkpoint, not --dataset.root: train with train.py first, or "
+                "give --mode=open_loop"
+            )
         check_experiments(self.experiments)
         if not self.experiments:
             raise ValueError(f"experiments is empty, valid: {', '.join(EXPERIMENTS)}")

@@ -5,16 +5,28 @@ only; LeRobot itself is imported where a dataset is written.
 """
 
 from hasm_torch.lerobot.card import write_card
-from hasm_torch.lerobot.episodes import Episode, EpisodeSet, FeatureMap, load_episodes, windows
+from hasm_torch.lerobot.episodes import (
+    Episode,
+    EpisodeSet,
+    EpisodeStream,
+    FeatureMap,
+    iter_episodes,
+    load_episodes,
+    open_episodes,
+    windows,
+)
 from hasm_torch.lerobot.recording import write_episodes
 from hasm_torch.lerobot.skin import SkinPatch, skin_patches
 
 __all__ = [
     "Episode",
     "EpisodeSet",
+    "EpisodeStream",
     "FeatureMap",
     "SkinPatch",
+    "iter_episodes",
     "load_episodes",
+    "open_episodes",
     "skin_patches",
     "windows",
     "write_card",

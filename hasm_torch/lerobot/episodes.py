@@ -7,6 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from hasm_torch.lerobot.episode_checks import (
+    check_finite,
+    check_spans,
+    check_tasks,
+    check_time,
+    flat,
+)
 from hasm_torch.lerobot.skin import (
     UNKNOWN_UNIT,
     SkinPatch,
@@ -105,52 +112,185 @@ def load_episodes(
     """
     from hasm_torch.lerobot import parquet  # loads pyarrow
 
-    root, names = Path(root), features or FeatureMap()
+    plan = _plan(Path(root), features or FeatureMap())
+    columns = parquet.read_columns(plan.files, plan.shapes)
+    check_spans(plan.spans, plan.indices, columns["episode_index"], plan.root)
+    check_time(columns["timestamp"], plan.spans, plan.indices, plan.fps, tolerance_s)
+    tasks = np.array(parquet.read_tasks(plan.root), dtype=object)
+    episodes = []
+    for index, (start, stop) in zip(plan.indices, plan.spans, strict=True):
+        mine = {key: values[start:stop] for key, values in columns.items()}
+        episodes.append(_episode_of(plan, mine, int(index), tasks, tolerance_s))
+    return EpisodeSet(
+        episodes, plan.fps, plan.joints, plan.units, plan.skin, plan.root, plan.action_names
+    )
+
+
+class EpisodeStream:
+    """The demonstrations of a dataset, read anew from disk at every iteration, one at a time.
+
+    For datasets that do not fit in memory: what is held is an episode and a row group of a file.
+    Attributes are those of `EpisodeSet`.
+
+    Args:
+        root: Folder of the dataset.
+        features: Names of the features to read; LeRobot's usual names by default.
+        tolerance_s: See `load_episodes`.
+
+    Raises:
+        FileNotFoundError, ValueError: as `load_episodes`, for episodes when they are reached.
+    """
+
+    def __init__(
+        self, root: str | Path, features: FeatureMap | None = None, tolerance_s: float = 1e-4
+    ) -> None:
+        from hasm_torch.lerobot import parquet  # loads pyarrow
+
+        self.root, self._tolerance_s = Path(root), tolerance_s
+        self._plan = _plan(self.root, features or FeatureMap())
+        plan = self._plan
+        self.fps, self.joints, self.units = plan.fps, plan.joints, plan.units
+        self.skin, self.action_names = plan.skin, plan.action_names
+        self._tasks = np.array(parquet.read_tasks(self.root), dtype=object)
+
+    def __len__(self) -> int:
+        return len(self._plan.spans)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of all frames in memory."""
+        entries = sum(int(np.prod(shape)) for shape in self._plan.shapes.values())
+        return int(self._plan.spans[-1][1]) * entries * 8
+
+    def __iter__(self) -> Iterator[Episode]:
+        from hasm_torch.lerobot import parquet
+
+        plan = self._plan
+        groups = parquet.iterate_columns(plan.files, plan.shapes)
+        held = {key: np.empty((0, *shape)) for key, shape in plan.shapes.items()}
+        for index, (start, stop) in zip(plan.indices, plan.spans, strict=True):
+            count = int(stop - start)
+            parts, rows = [held], len(held["timestamp"])
+            while rows < count:
+                part = next(groups, None)
+                if part is None:
+                    raise ValueError(
+                        f"Expected {count} frames of episode {index} in {self.root}/data as "
+                        f"meta/episodes says, got {rows}. The recording was cut off or the files "
+                        "were changed."
+                    )
+                parts.append(part)
+                rows += len(part["timestamp"])
+            filled = [part for part in parts if len(part["timestamp"])]
+            joined = {key: np.concatenate([part[key] for part in filled]) for key in held}
+            held = {key: values[count:] for key, values in joined.items()}
+            mine = {key: values[:count] for key, values in joined.items()}
+            check_spans([(0, count)], np.array([index]), mine["episode_index"], self.root)
+            yield _episode_of(plan, mine, int(index), self._tasks, self._tolerance_s)
+
+
+def open_episodes(
+    root: str | Path, features: FeatureMap | None = None, most_bytes: int = 1 << 30
+) -> EpisodeSet | EpisodeStream:
+    """A dataset in memory where it takes up to ``most_bytes`` there, else as a stream.
+
+    Args:
+        root: Folder of the dataset.
+        features: Names of the features to read; LeRobot's usual names by default.
+        most_bytes: Most memory for the frames.
+
+    Raises:
+        FileNotFoundError, ValueError: see `load_episodes`.
+    """
+    stream = EpisodeStream(root, features)
+    return stream if stream.nbytes > most_bytes else load_episodes(root, features)
+
+
+def iter_episodes(root: str | Path, features: FeatureMap | None = None) -> Iterator[Episode]:
+    """The episodes of a dataset, one at a time; see `EpisodeStream`."""
+    return iter(EpisodeStream(root, features))
+
+
+@dataclass(eq=False)
+class _Plan:
+    """What ``meta`` says about a dataset: where its episodes lie and what its columns mean."""
+
+    root: Path
+    names: FeatureMap
+    fps: float
+    shapes: dict[str, tuple[int, ...]]
+    files: list[Path]
+    indices: np.ndarray
+    spans: list[tuple[int, int]]
+    declared: Mapping[str, Any]
+    layout: tuple[int, int] | None
+    skin: dict[str, SkinPatch] | None
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return _entry_names(self.declared[self.names.state], self.names.state)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return _units(self.declared[self.names.state], len(self.joints), self.names.state)
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        return _entry_names(self.declared[self.names.action], self.names.action)
+
+
+def _plan(root: Path, names: FeatureMap) -> _Plan:
+    from hasm_torch.lerobot import parquet  # loads pyarrow
+
     info = parquet.read_info(root)
     declared = info["features"]
-    has_skin = names.tactile in declared
-    keys = [names.state, names.action, *([names.tactile] if has_skin and names.tactile else [])]
+    tactile = names.tactile if names.tactile in declared else None
+    keys = [names.state, names.action, *([tactile] if tactile else [])]
     shapes: dict[str, tuple[int, ...]] = {key: _shape(declared, key, root) for key in keys}
     rows = parquet.read_episode_rows(root)
     spans = list(zip(rows["dataset_from_index"], rows["dataset_to_index"], strict=True))
     if not spans:
         raise ValueError(f"Expected at least one episode in {root}, got none.")
-    columns = parquet.read_columns(
-        _data_files(root, info, rows),
-        {**shapes, "timestamp": (), "episode_index": (), "task_index": ()},
+    layout = tactile_layout(declared[tactile], tactile) if tactile else None
+    return _Plan(
+        root=root,
+        names=names,
+        fps=float(info["fps"]),
+        shapes={**shapes, "timestamp": (), "episode_index": (), "task_index": ()},
+        files=_data_files(root, info, rows),
+        indices=rows["episode_index"],
+        spans=spans,
+        declared=declared,
+        layout=layout,
+        skin=skin_from_info(declared[tactile], *layout, tactile) if tactile and layout else None,
     )
-    _check_spans(spans, rows["episode_index"], columns["episode_index"], root)
-    time = columns["timestamp"]
-    fps = float(info["fps"])
-    _check_time(time, spans, rows["episode_index"], fps, tolerance_s)
-    for key in keys:
-        columns[key] = columns[key].astype(np.float32, copy=False)
-        _check_finite(columns[key], key, spans, rows["episode_index"])
 
-    tasks = np.array(parquet.read_tasks(root), dtype=object)
-    _check_tasks(columns["task_index"], tasks, root)
-    tactile, skin = None, None
-    if has_skin and names.tactile:
-        cells, channels = tactile_layout(declared[names.tactile], names.tactile)
-        skin = skin_from_info(declared[names.tactile], cells, names.tactile)
-        tactile = columns[names.tactile].reshape(-1, cells, channels)
-    state, action = (_flat(columns[key]) for key in (names.state, names.action))
-    episodes = [
-        Episode(
-            index=int(index),
-            # an episode with several tasks names them in the order in which they come up
-            task="; ".join(dict.fromkeys(tasks[columns["task_index"][start:stop]])),
-            time=time[start:stop],
-            state=state[start:stop],
-            action=action[start:stop],
-            tactile=None if tactile is None else tactile[start:stop],
-        )
-        for index, (start, stop) in zip(rows["episode_index"], spans, strict=True)
-    ]
-    joints = _entry_names(declared[names.state], names.state)
-    units = _units(declared[names.state], len(joints), names.state)
-    actions = _entry_names(declared[names.action], names.action)
-    return EpisodeSet(episodes, fps, joints, units, skin, root, actions)
+
+def _episode_of(
+    plan: _Plan,
+    columns: dict[str, np.ndarray],
+    index: int,
+    tasks: np.ndarray,
+    tolerance_s: float,
+) -> Episode:
+    """One episode from its own rows, checked."""
+    names, spans, indices = plan.names, [(0, len(columns["timestamp"]))], np.array([index])
+    check_time(columns["timestamp"], spans, indices, plan.fps, tolerance_s)
+    for key in (names.state, names.action, *([names.tactile] if plan.layout else [])):
+        columns[str(key)] = columns[str(key)].astype(np.float32, copy=False)
+        check_finite(columns[str(key)], str(key), spans, indices)
+    check_tasks(columns["task_index"], tasks, plan.root)
+    return Episode(
+        index=index,
+        # an episode with several tasks names them in the order in which they come up
+        task="; ".join(dict.fromkeys(tasks[columns["task_index"]])),
+        time=columns["timestamp"],
+        state=flat(columns[names.state]),
+        action=flat(columns[names.action]),
+        tactile=None
+        if plan.layout is None
+        else columns[str(names.tactile)].reshape(-1, *plan.layout),
+    )
 
 
 def windows(values: np.ndarray, offsets: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -182,93 +322,12 @@ def _shape(declared: Mapping[str, Any], key: str, root: Path) -> tuple[int, ...]
     return () if shape == (1,) else shape  # LeRobot stores one entry as a plain number
 
 
-def _flat(values: np.ndarray) -> np.ndarray:
-    return values.reshape(len(values), -1)
-
-
 def _data_files(root: Path, info: Mapping[str, Any], rows: Mapping[str, np.ndarray]) -> list[Path]:
     template = info.get("data_path", "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet")
     places = dict.fromkeys(
         zip(rows["data/chunk_index"].tolist(), rows["data/file_index"].tolist(), strict=True)
     )
     return [root / template.format(chunk_index=chunk, file_index=file) for chunk, file in places]
-
-
-def _check_spans(
-    spans: list[tuple[int, int]], indices: np.ndarray, found: np.ndarray, root: Path
-) -> None:
-    lengths = np.array([stop - start for start, stop in spans])
-    starts = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    if (lengths < 1).any() or (starts != [start for start, _ in spans]).any():
-        raise ValueError(
-            f"Expected episodes of at least one frame that follow each other in {root}/meta/"
-            f"episodes, got frame ranges {[(int(a), int(b)) for a, b in spans[:10]]}."
-        )
-    expected = np.repeat(indices, lengths)
-    if len(expected) != len(found):
-        raise ValueError(
-            f"Expected {len(expected)} frames in {root}/data as meta/episodes says, "
-            f"got {len(found)}. The recording was cut off or the files were changed."
-        )
-    wrong = np.flatnonzero(expected != found)
-    if wrong.size:
-        raise ValueError(
-            f"Expected frame {wrong[0]} of {root}/data to be of episode {expected[wrong[0]]}, "
-            f"got episode {found[wrong[0]]}."
-        )
-
-
-def _check_time(
-    time: np.ndarray,
-    spans: list[tuple[int, int]],
-    indices: np.ndarray,
-    fps: float,
-    tolerance_s: float,
-) -> None:
-    if not fps > 0:
-        raise ValueError(f"Expected a positive frame rate in meta/info.json, got fps={fps}.")
-    _check_finite(time, "timestamp", spans, indices)
-    step = np.diff(time.astype(np.float64))
-    # time stamps are float32: late in a long episode they are no finer than this
-    tolerance = tolerance_s + np.spacing(np.abs(time[1:])).astype(np.float64)
-    bad = (step <= 0) | (np.abs(step - 1 / fps) > tolerance)
-    bad[[start - 1 for start, _ in spans[1:]]] = False
-    if bad.any():
-        frame = int(np.flatnonzero(bad)[0]) + 1
-        episode, offset = _locate(frame, spans, indices)
-        raise ValueError(
-            f"Expected time stamps {1 / fps:.6g} s apart ({fps:g} fps), got a step of "
-            f"{step[frame - 1]:.6g} s to frame {offset} of episode {episode}. Resample the "
-            "recording, correct fps, or pass a larger tolerance_s."
-        )
-
-
-def _check_finite(
-    values: np.ndarray, key: str, spans: list[tuple[int, int]], indices: np.ndarray
-) -> None:
-    flat = _flat(values)
-    bad = ~np.isfinite(flat).all(axis=1)
-    if bad.any():
-        frame = int(np.flatnonzero(bad)[0])
-        episode, offset = _locate(frame, spans, indices)
-        entry = int(np.flatnonzero(~np.isfinite(flat[frame]))[0])
-        raise ValueError(
-            f"Expected finite numbers in {key!r}, got {flat[frame, entry]} in entry {entry} of "
-            f"frame {offset} of episode {episode}; {int(bad.sum())} frames are affected."
-        )
-
-
-def _locate(frame: int, spans: list[tuple[int, int]], indices: np.ndarray) -> tuple[int, int]:
-    row = int(np.searchsorted([start for start, _ in spans], frame, side="right")) - 1
-    return int(indices[row]), frame - int(spans[row][0])
-
-
-def _check_tasks(found: np.ndarray, tasks: np.ndarray, root: Path) -> None:
-    if found.min() < 0 or found.max() >= len(tasks):
-        raise ValueError(
-            f"Expected task numbers from 0 to {len(tasks) - 1} as {root}/meta/tasks.parquet has "
-            f"{len(tasks)} tasks, got {found.min()} to {found.max()}."
-        )
 
 
 def _entry_names(feature: Mapping[str, Any], key: str) -> tuple[str, ...]:

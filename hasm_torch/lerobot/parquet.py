@@ -1,7 +1,8 @@
 """Whole columns of a LeRobot v3.0 dataset as NumPy arrays, straight from its parquet files."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -50,6 +51,14 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
         FileNotFoundError: The file is missing.
         ValueError: The file is damaged, or lacks a column.
     """
+    names = None if columns is None else list(columns)
+    return _open(path, lambda file: file.read(columns=names), names)
+
+
+def _open[Found](
+    path: Path, read: Callable[[pq.ParquetFile], Found], columns: Sequence[str] | None = None
+) -> Found:
+    """What `read` finds in a parquet file; errors as in `read_table`."""
     if not path.is_file():
         raise FileNotFoundError(f"The dataset is incomplete: {path} is missing.")
     try:
@@ -58,7 +67,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
             if missing:
                 found = file.schema_arrow.names
                 raise ValueError(f"Expected columns {sorted(missing)} in {path}, found {found}.")
-            return file.read(columns=None if columns is None else list(columns))
+            return read(file)
     except (pa.ArrowException, OSError) as error:
         raise ValueError(
             f"{path} ({path.stat().st_size} bytes) is empty, truncated or damaged: {error}. "
@@ -119,6 +128,23 @@ def read_columns(
         key: np.concatenate([to_array(t.column(key), shape, f"{key!r} in {p}") for t, p in parts])
         for key, shape in shapes.items()
     }
+
+
+def iterate_columns(
+    paths: Sequence[Path], shapes: Mapping[str, tuple[int, ...]]
+) -> Iterator[dict[str, np.ndarray]]:
+    """Columns of several files, one row group after the other; arguments as in `read_columns`."""
+    for path in paths:
+        for group in range(_open(path, lambda file: file.num_row_groups, list(shapes))):
+            table = _open(path, partial(_read_group, group=group, columns=list(shapes)))
+            yield {
+                key: to_array(table.column(key), shape, f"{key!r} in {path}")
+                for key, shape in shapes.items()
+            }
+
+
+def _read_group(file: pq.ParquetFile, group: int, columns: list[str]) -> pa.Table:
+    return file.read_row_group(group, columns=columns)
 
 
 def to_array(column: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:

@@ -28,6 +28,7 @@ class SkinPatch:
         normals: ``(cells, 3)`` outward unit normals in the link's frame, or None.
         points: ``(cells, 3, 3)`` the force points of each cell in the link's frame, m, or None.
         unit: Unit of its readings.
+        channels: Readings a cell: 3 forces, 1 pressure or a wrench of 6.
     """
 
     name: str
@@ -37,6 +38,7 @@ class SkinPatch:
     normals: np.ndarray | None = None
     points: np.ndarray | None = None
     unit: str = "N"
+    channels: int = 3
 
 
 def skin_patches(skin: "Skin") -> dict[str, SkinPatch]:
@@ -109,7 +111,9 @@ def _patch_to_info(patch: SkinPatch) -> dict[str, Any]:
     return info
 
 
-def skin_from_info(feature: Mapping[str, Any], cells: int, key: str) -> dict[str, SkinPatch]:
+def skin_from_info(
+    feature: Mapping[str, Any], cells: int, channels: int, key: str
+) -> dict[str, SkinPatch]:
     """The patches that a tactile feature's ``info`` describes.
 
     ``info["patches"]`` may hold patch descriptions (name, start, stop and, where known, link,
@@ -119,6 +123,7 @@ def skin_from_info(feature: Mapping[str, Any], cells: int, key: str) -> dict[str
     Args:
         feature: The feature's entry in ``meta/info.json``.
         cells: Cells of the whole skin.
+        channels: Readings a cell.
         key: Name of the feature, for error messages.
 
     Raises:
@@ -160,7 +165,9 @@ def skin_from_info(feature: Mapping[str, Any], cells: int, key: str) -> dict[str
                 f"{key!r}: patch {name!r} has cells {span.start} to {span.stop}; expected a name "
                 f"of its own and cells within 0 to {cells}."
             )
-        skin[name] = SkinPatch(name, span, entry.get("link"), unit=unit, **geometry)
+        skin[name] = SkinPatch(
+            name, span, entry.get("link"), unit=unit, channels=channels, **geometry
+        )
     return skin
 
 
