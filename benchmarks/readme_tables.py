@@ -71,8 +71,9 @@ def main() -> None:
     text = options.readme.read_text()
     printed = "```\n" + re.sub(r" +$", "", table(default), flags=re.M) + "\n```"
     for name, content in (("default", printed), ("literal", comparison(default, literal))):
-        pattern = rf"(<!-- table:{name} -->\n).*?(<!-- /table:{name} -->)"
-        text = re.sub(pattern, lambda m, c=content: m[1] + c + "\n" + m[2], text, flags=re.S)
+        before, _, rest = text.partition(f"<!-- table:{name} -->\n")
+        _, end, after = rest.partition(f"<!-- /table:{name} -->")
+        text = f"{before}<!-- table:{name} -->\n{content}\n{end}{after}"
     options.readme.write_text(text)
 
 

@@ -150,9 +150,7 @@ class HASM(nn.Module):
         return Rollout(deque(maxlen=window), np.zeros(len(self.body.patches)))
 
     @torch.no_grad()
-    def step(
-        self, state: Tensor, skin: Tensor | None, rollout: Rollout | None = None
-    ) -> Tensor:
+    def step(self, state: Tensor, skin: Tensor | None, rollout: Rollout | None = None) -> Tensor:
         """One control step.
 
         Args:
