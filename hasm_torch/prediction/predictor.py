@@ -25,7 +25,8 @@ from hasm_torch.prediction.annealing import anneal
 from hasm_torch.prediction.own_codes import OwnCodes
 from hasm_torch.prediction.series import Moments, thin
 from hasm_torch.prediction.settings import PredictionSettings
-from hasm_torch.rope3d import rope3d, touch_rotation
+from hasm_torch.query_kernel import block_rotations
+from hasm_torch.rope3d import touch_rotation
 from hasm_torch.touch import TactileEmbedding
 
 # Queries of one block; bounds the (block, joints, shortlist) arrays.
@@ -71,6 +72,7 @@ class JointPredictor(nn.Module):
 
     Attributes:
         moving: Indices of the joints that move in the episodes; the others stay where they are.
+        patches: Patches that have a segment of their own.
         memory: Associations m = s ⊗ o; the values are displacement to the successor, recent
             displacement and position of every moving joint.
         cells: (count, channels) cells of the stored place codes, see ``OwnCodes``.
@@ -106,10 +108,15 @@ class JointPredictor(nn.Module):
         channels, bits = self.place_code.joints, self.place_code.bits
         self.own_codes = OwnCodes(self.place_code)
         self.embedding = TactileEmbedding(channels, settings.neurons, bits)
-        self.touch = settings.touch if learned.touch.shape[1] else 0.0
-        directions = body.directions if self.touch and settings.patches == "each" else []
-        self._rotations = [touch_rotation(torch.tensor(d, dtype=torch.float32)) for d in directions]
-        self.segments = len(self._rotations) or 1
+        felt = learned.touch.amax(0) > 0
+        self.touch = settings.touch if bool(felt.any()) else 0.0
+        each = bool(self.touch) and settings.patches == "each"
+        self.patches = torch.nonzero(felt).flatten() if each else felt.new_zeros(0).long()
+        self.turns = [
+            _turn(self.place_code.code_dim, body.directions[patch])
+            for patch in self.patches.tolist()
+        ]
+        self.segments = len(self.turns) or 1
         self.memory = HeteroAssociativeMemory(
             self.segments * self.place_code.code_dim,
             3 * len(self.moving),
@@ -164,11 +171,11 @@ class JointPredictor(nn.Module):
         state = place_code(levels, coder.bits, coder.code, torch.float32)
         if not self.touch:
             touch = -torch.ones_like(state)  # F of ρ = 0
-        elif self._rotations:
-            density = (self.touch * found.touch).float()
+        elif self.turns:
+            density = (self.touch * found.touch[:, self.patches]).float()
             segments = self.embedding(density, levels.unsqueeze(1)).unbind(1)
-            rotated = zip(segments, self._rotations, strict=True)
-            touch = torch.cat([_rotate(f, *turn) for f, turn in rotated], dim=-1)
+            pairs = zip(segments, self.turns, strict=True)
+            touch = torch.cat([_rotate(code, turn) for code, turn in pairs], dim=-1)
         else:
             touch = self.embedding((self.touch * found.touch.mean(-1)).float(), levels)
         return state.repeat(1, self.segments), touch, levels.unflatten(-1, (coder.joints, -1))
@@ -218,9 +225,19 @@ class JointPredictor(nn.Module):
         return Recalled(means[0], recent - means[1], state - means[2])
 
 
-def _rotate(code: Tensor, axis: Tensor, angle: Tensor) -> Tensor:
-    """RoPE3D, taken by sign; a touch from the reference direction turns nothing."""
-    return binarise(rope3d(code, axis, angle)) if float(angle) else code
+def _turn(dim: int, direction: list[float]) -> Tensor | None:
+    """RoPE3D of a touch from a direction, (blocks, 3, 3); None where it turns nothing."""
+    axis, angle = touch_rotation(torch.tensor(direction, dtype=torch.float32))
+    return block_rotations(dim, axis, angle) if float(angle) else None
+
+
+def _rotate(code: Tensor, turn: Tensor | None) -> Tensor:
+    """Codes (K, D) rotated block by block and taken by sign."""
+    if turn is None:
+        return code
+    blocks, tail = code[:, : 3 * len(turn)], code[:, 3 * len(turn) :]
+    turned = torch.einsum("bij,kbj->kbi", turn, blocks.unflatten(-1, (-1, 3)))
+    return binarise(torch.cat([turned.flatten(1), tail], dim=-1))
 
 
 def int8_scores(memory: HeteroAssociativeMemory, query: Tensor) -> Tensor:

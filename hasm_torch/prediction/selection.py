@@ -25,9 +25,9 @@ FIRST_EMPHASIS, FIRST_PERPLEXITY = 3.0, 12.0
 
 # Recordings of fewer frames than this are split three ways, each part left out once; of longer
 # ones a quarter is left out. So many frames a part are predicted.
-FEW_FRAMES, SPLITS, LEFT_OUT, QUERIES = 8000, 3, 4, 600
+FEW_FRAMES, SPLITS, LEFT_OUT, QUERIES = 3000, 3, 4, 600
 # A code of more entries than this, for many patches, is not tried.
-LARGEST_CODE = 32768
+LARGEST_CODE = 16384
 
 Split = tuple[Moments, Moments]  # learned, left out
 Part = tuple[list[Series], list[Series]]  # learned, left out
@@ -57,7 +57,7 @@ def choose_settings(
         error = _first_error(tried, parts, body, horizon)
         if error < lowest:
             best, lowest = tried, error
-    for tried in _touches(best, body):
+    for tried in list(_touches(best, series, body)):
         error = _first_error(tried, parts, body, horizon)
         if error < lowest:
             best, lowest = tried, error
@@ -128,14 +128,17 @@ def _contexts(rate: float) -> list[tuple[float, float]]:
     return [(back[0], 0.0), *((context_s, w) for context_s in back for w in CONTEXTS)]
 
 
-def _touches(best: PredictionSettings, body: Body) -> Iterator[PredictionSettings]:
+def _touches(
+    best: PredictionSettings, series: Sequence[Series], body: Body
+) -> Iterator[PredictionSettings]:
     if not body.channels:
         return
+    felt = int((torch.stack([episode.touch.amax(0) for episode in series]).amax(0) > 0).sum())
     channels = len(body.joints) * (2 if best.context > 0 else 1)
     code = channels * best.neurons * best.bits_for(channels)
-    for touch in TOUCHES:
+    for touch in TOUCHES if felt else ():
         yield replace(best, touch=touch, patches="whole")
-        if 1 < len(body.patches) <= LARGEST_CODE // code:
+        if 1 < felt <= LARGEST_CODE // code:
             yield replace(best, touch=touch, patches="each")
 
 
