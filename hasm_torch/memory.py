@@ -9,6 +9,7 @@ Signals", sections "Association Creation" and "Hetero-associative Sequential Mem
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor, nn
@@ -181,7 +182,7 @@ class HeteroAssociativeMemory(AssociationStore):
             RuntimeError: If the memory is empty.
         """
         self._check_query(query)
-        with torch.autocast(query.device.type, enabled=False):
+        with _full_precision(query.device.type):
             if self.interaction != "softmax":
                 weights = self._interacting(query, mask)
                 return weights.to(self.successors.dtype) @ self.successors
@@ -210,7 +211,7 @@ class HeteroAssociativeMemory(AssociationStore):
             raise ValueError(
                 f"inspect needs normalised weights, interaction 'softmax', got {self.interaction!r}"
             )
-        with torch.autocast(query.device.type, enabled=False):
+        with _full_precision(query.device.type):
             if self.storage == "bit":
                 return inspect_packed(*self._packed(query), count=self.count, mask=mask)
             recalled = inspect_dense(*self._dense(query), count=self.count, mask=mask)
@@ -228,7 +229,7 @@ class HeteroAssociativeMemory(AssociationStore):
             (..., capacity), 0 for rows that are empty or masked.
         """
         self._check_query(query)
-        with torch.autocast(query.device.type, enabled=False):
+        with _full_precision(query.device.type):
             return self._interacting(query, mask)
 
     def iterate(
@@ -285,3 +286,10 @@ class HeteroAssociativeMemory(AssociationStore):
             raise ValueError(f"expected query (..., {self.code_dim}), got {tuple(query.shape)}")
         if not torch.compiler.is_compiling() and int(self.count) == 0:
             raise RuntimeError("the memory is empty: write at least one association first")
+
+
+def _full_precision(device: str) -> AbstractContextManager[None]:
+    """Scores in full precision under autocast; entering autocast costs, so only where it is on."""
+    if torch.is_autocast_enabled(device):
+        return torch.autocast(device, enabled=False)
+    return nullcontext()

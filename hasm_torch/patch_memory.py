@@ -90,13 +90,19 @@ class PatchMemory(nn.Module):
         Returns:
             State code s and rotated tactile code o, both (..., D).
         """
+        self.place_code.check(positions)
         if len(self.touch_levels):
             nearest = (density.unsqueeze(-1) - self.touch_levels).abs().argmin(-1)
             density = self.touch_levels[nearest]
+        return self._encode(positions, density, link)
+
+    def _encode(
+        self, positions: Tensor, density: Tensor, link: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """``codes`` of checked positions at a stored rate density."""
         coder = self.place_code
         on_cpu = positions.device.type == "cpu" and not torch.compiler.is_compiling()
         if link is None and on_cpu and positions.dtype == torch.float32:
-            coder.check(positions)
             return encode_query(positions, density, coder, self.rotations, self.rebinarise)
         levels = coder.levels(positions)
         touch = self.embedding(density, levels).to(positions.dtype)
@@ -148,8 +154,12 @@ class PatchMemory(nn.Module):
     ) -> tuple[NDArray[np.float64], float]:
         """``forward`` of one query in arrays, for the control loop: (J,) positions and pace."""
         query = torch.from_numpy(positions.astype(np.float32)).to(self.joints.device)
+        levels = self.touch_levels.cpu().numpy()
+        if len(levels):
+            density = float(levels[np.abs(levels - np.float32(density)).argmin()])
         level = torch.tensor(density, dtype=torch.float32, device=self.joints.device)
-        decision = self.memory(*self.codes(query, level, link)).cpu().numpy().astype(np.float64)
+        state, touch = self._encode(query, level, link)
+        decision = self.memory(state, touch).cpu().numpy().astype(np.float64)
         return decision[:-1], float(decision[-1])
 
     def weights(self, positions: Tensor, density: Tensor, link: Tensor | None = None) -> Tensor:
