@@ -13,19 +13,19 @@ from hasm_torch.prediction.predictor import JointPredictor, Recalled
 from hasm_torch.prediction.series import Moments, Series, moments, thin
 from hasm_torch.prediction.settings import PredictionSettings
 
-# What is tried; of equals the first is taken.
+# What is tried.
 CONTEXT_S = (0.0, 0.1, 0.3)  # 0 is one frame
 CONTEXTS = (0.25, 1.0)
 TOUCHES = (0.1, 0.3)
-EMPHASES = (3.0, 0.0, 10.0)
-PERPLEXITIES = (16.0, 8.0, 4.0, 32.0, 64.0)
-SHIFTS = (1.0, 0.5, 0.0)
+EMPHASES = (0.0, 3.0, 10.0)
+PERPLEXITIES = (4.0, 8.0, 16.0, 32.0, 64.0)
+SHIFTS = (0.0, 0.5, 1.0)
 NEIGHBOUR_TOUCHES = (0.25, 1.0)
 FIRST_EMPHASIS, FIRST_PERPLEXITY = 3.0, 12.0
 
-# Recordings of fewer frames or episodes than this are split three ways, each part left out once;
-# of longer ones a quarter is left out. So many frames a part are predicted.
-FEW_FRAMES, FEW_EPISODES, SPLITS, LEFT_OUT, QUERIES = 3000, 40, 3, 4, 600
+# Recordings of fewer frames than this are split three ways, each part left out once; of longer
+# ones a quarter is left out. So many frames a part are predicted.
+FEW_FRAMES, SPLITS, LEFT_OUT, QUERIES = 3000, 3, 4, 600
 # A code of more entries than this, for many patches, is not tried.
 LARGEST_CODE = 16384
 
@@ -98,8 +98,7 @@ def _parts(series: Sequence[Series], generator: np.random.Generator) -> Iterator
             f"expected at least 2 episodes, to leave some out for choosing, got {len(series)}"
         )
     order = generator.permutation(len(series))
-    frames = sum(len(episode.state) for episode in series)
-    few = frames < FEW_FRAMES or len(series) < FEW_EPISODES
+    few = sum(len(episode.state) for episode in series) < FEW_FRAMES
     folds = min(SPLITS if few else LEFT_OUT, len(series))
     for fold in range(folds if few else 1):
         out = set(order[fold::folds].tolist())
