@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from hasm_torch.config import MemoryShape
 from hasm_torch.readings import forces_of
 from hasm_torch.successors import distinct_links, shifted_links
-from hasm_torch.touch import pair_with_spikes
+from hasm_torch.touch import pair_with_spikes, spike_density
 
 if TYPE_CHECKING:
     from hasm_torch.hasm import HASM
@@ -191,7 +191,7 @@ def spike_series(model: "HASM", skin: Tensor) -> tuple[Tensor, Tensor]:
     window = max(1, round(config.rate_window_s * rate))
     total = torch.nn.functional.pad(counts.cumsum(0), (0, 0, window, 0))
     windowed = (total[window:] - total[:-window]) * (rate / window)
-    return counts, torch.clamp(windowed / config.max_rate, 0.0, 1.0)
+    return counts, spike_density(windowed, config.max_rate)
 
 
 def _moved_joints(model: "HASM", chains: Sequence[Chain]) -> list[int]:
