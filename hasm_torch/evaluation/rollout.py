@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -23,10 +23,21 @@ class Policy(Protocol):
 
 
 class Human(Protocol):
-    """Whoever touches the robot."""
+    """Whoever touches the robot with one finger."""
 
     def touch(self, time: float, state: Array) -> tuple[str | None, float]:
         """Patch to press and force, N, from now on; None leaves the skin alone."""
+
+    def finished(self, time: float, state: Array) -> bool:
+        """Whether the rollout is over."""
+
+
+@runtime_checkable
+class Holder(Protocol):
+    """Whoever touches several patches of the robot at once."""
+
+    def touches(self, time: float, state: Array) -> dict[str, float]:
+        """Force on each patch that is pressed from now on, N; the other skin is left alone."""
 
     def finished(self, time: float, state: Array) -> bool:
         """Whether the rollout is over."""
@@ -41,8 +52,8 @@ class Trace:
         state: (T, joints) measured joint positions, rad or m.
         target: (T, joints) joint targets, rad or m.
         velocity: (T, joints) measured joint speeds, rad/s or m/s.
-        force: (T,) force that the finger really applied, N.
-        patch: (T,) name of the patch pressed, or None.
+        force: (T,) force that the fingers really applied, N.
+        patch: (T,) name of the (first) patch pressed, or None.
         object_height: (T,) height of the object above its place on the table, m.
         success: What the environment said at the end.
         frames: Pictures, if asked for.
@@ -64,7 +75,7 @@ class Trace:
 def roll_out(
     env: Any,
     policy: Policy,
-    human: Human,
+    human: Human | Holder,
     joints: Array,
     seed: int,
     object_offset: tuple[float, float] = (0.0, 0.0),
@@ -95,7 +106,10 @@ def roll_out(
     success = False
     time, state = float(info["time"]), np.asarray(observation["state"], dtype=np.float64)
     while not human.finished(time, state):
-        sim.touch(*human.touch(time, state))
+        if isinstance(human, Holder):
+            sim.touch_all(human.touches(time, state))
+        else:
+            sim.touch(*human.touch(time, state))
         target = policy.step(
             torch.from_numpy(observation["state"]), torch.from_numpy(observation["tactile"])
         ).numpy()

@@ -1,11 +1,12 @@
 """The touched HSR as a Gymnasium environment.
 
     joint targets ──SlewedReference──► drives ─┐
-    touch(patch, force) ──Finger───────────────┴─► MuJoCo ──► joint state, skin forces
+    touch(patch, force) ──Hand─────────────────┴─► MuJoCo ──► joint state, skin forces
 
 One step is a control tick of 20 ms, in which the physics takes ten steps.
 """
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
@@ -15,7 +16,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from hasm_torch.robot import JOINTS, Skin
-from hasm_torch.sim.finger import Finger
+from hasm_torch.sim.finger import Hand
 from hasm_torch.sim.poses import START_POSES
 from hasm_torch.sim.render import SceneRenderer
 from hasm_torch.sim.scene import (
@@ -51,7 +52,7 @@ _LIFTED = 0.05  # m
 
 
 class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
-    """An HSR with artificial skin that a human finger touches.
+    """An HSR with artificial skin that a human touches with one or two fingers.
 
     Observation: {"state": (8,) joint positions in the order of `JOINTS`, rad (arm_lift m);
     "tactile": (cells * 3,) normal forces of all skin cells, N}. Action: (8,) joint targets,
@@ -61,7 +62,7 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
 
     `info` holds "is_success" (the object is lifted and held; always False in "compliance"),
     "object_height" (m above the table, 0 without an object), "finger_force" (N, that the skin
-    really gets), "touched" (patch or None), "time" (s).
+    really gets in all), "touched" (first patch that feels its finger, or None), "time" (s).
 
     Args:
         scene: "compliance" or "grasp".
@@ -86,8 +87,6 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         self.skin = Skin.load()
         self.model = build_model(scene, self.skin)
         self.data = mujoco.MjData(self.model)
-        self._positions, self._normals = self.skin.positions.numpy(), self.skin.normals.numpy()
-
         joints = [self.model.joint(name) for name in JOINTS]
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
@@ -106,10 +105,9 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
             1 / CONTROL_RATE,
             _SUBSTEPS,
         )
-        self._finger = Finger(self.model)
+        self._hand = Hand(self.model, self.skin, LARGEST_FORCE)
         self._sensor = SkinSensor(self.model, self.skin)
         self._renderer: SceneRenderer | None = None
-        self._touched: str | None = None
         self.skin_forces: Array = np.zeros((self.skin.cells, 3))
         self._steps = 0
 
@@ -141,7 +139,7 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         return self.data.body("object").xpos.copy() if self.scene == "grasp" else None
 
     def touch(self, patch: str | None, force: float = 0.0, cell: int | None = None) -> None:
-        """Sets what the finger does from the next step on.
+        """Sets what one finger does from the next step on; a second one lets go.
 
         Args:
             patch: Skin patch to push, or None to let go.
@@ -151,27 +149,20 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         Raises:
             ValueError: The patch or the cell does not exist, or the force is out of range.
         """
-        if patch is None:
-            self._touched = None
-            self._finger.let_go()
-            return
-        if patch not in self.skin.patches:
-            raise ValueError(
-                f"patch must be None or one of {tuple(self.skin.patches)}, got {patch!r}"
-            )
-        if not 0.0 <= force <= LARGEST_FORCE:
-            raise ValueError(f"force must be 0 to {LARGEST_FORCE:g} N, got {force}")
-        span = self.skin.slices[patch]
-        if cell is not None and not 0 <= cell < span.stop - span.start:
-            last = span.stop - span.start - 1
-            raise ValueError(f"cell of {patch} must be 0 to {last}, got {cell}")
-        points = self._positions[span]
-        point = points.mean(0) if cell is None else points[cell]
-        body = self.model.body(self.skin.link[patch]).id
-        if patch != self._touched:
-            self._finger.let_go()
-        self._touched = patch
-        self._finger.command(body, point, self._normals[span][0], float(force))
+        self._hand.touch({} if patch is None else {patch: (force, cell)})
+
+    def touch_all(self, forces: Mapping[str, float]) -> None:
+        """Sets what both fingers do from the next step on, each at the centre of a patch.
+
+        Args:
+            forces: Force on each patch touched, N, 0 to 15; one finger lets go of a patch with 0
+                and of one that is not named.
+
+        Raises:
+            ValueError: More than two patches are given, one does not exist, or a force is out of
+                range.
+        """
+        self._hand.touch({patch: (force, None) for patch, force in forces.items()})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -202,7 +193,7 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
             self.data.qpos[address : address + 2] = np.array(OBJECT_POSITION) + offset
         self.data.ctrl[:] = self._reference.position
         self.touch(None)
-        self._finger.prepare(self.data)
+        self._hand.prepare(self.data)
         mujoco.mj_forward(self.model, self.data)
         self._steps = 0
         self.skin_forces = self._sensor.read(self.data)
@@ -222,13 +213,13 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         target = _vector(action, len(JOINTS), "action")
         self._reference.stay_near(self.joint_position, _LARGEST_LEAD)
         references = self._reference.plan(target)
-        model, data, finger = self.model, self.data, self._finger
-        pushing = finger.prepare(data)
+        model, data, hand = self.model, self.data, self._hand
+        pushing = hand.prepare(data)
         for reference in references:
             data.ctrl[:] = reference
             if pushing:
                 mujoco.mj_step1(model, data)
-                finger.push()
+                hand.push()
                 mujoco.mj_step2(model, data)
             else:
                 mujoco.mj_step(model, data)
@@ -249,7 +240,7 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
             return None
         if self._renderer is None:
             self._renderer = SceneRenderer(self.model, self.skin, self.scene)
-        return self._renderer.render(self.data, self.skin_forces, self._touched)
+        return self._renderer.render(self.data, self.skin_forces, self._hand.touching)
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -272,13 +263,14 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         return {"state": state, "tactile": tactile}
 
     def _info(self) -> dict[str, Any]:
-        force = float(self.skin_forces.sum())
         height, held = self._object_state()
+        forces = self.skin_forces
+        felt = (p for p in self._hand.touching if forces[self.skin.slices[p]].any())
         return {
             "is_success": held and height >= _LIFTED,
             "object_height": height,
-            "finger_force": force,
-            "touched": self._touched if force > 0.0 else None,
+            "finger_force": float(forces.sum()),
+            "touched": next(felt, None),
             "time": self._steps / CONTROL_RATE,
         }
 

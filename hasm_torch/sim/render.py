@@ -1,7 +1,8 @@
-"""Pictures of a scene: the robot, the skin cells coloured by their force, the human finger."""
+"""Pictures of a scene: the robot, the skin cells coloured by their force, the human fingers."""
 
 import importlib
 import os
+from collections.abc import Mapping
 from typing import ClassVar
 
 import mujoco
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hasm_torch.robot import Skin
+from hasm_torch.sim.finger import Finger
 from hasm_torch.sim.scene import FINGER_RADIUS
 
 Array = NDArray[np.float64]
@@ -64,7 +66,6 @@ class SceneRenderer:
         view = _CAMERAS[scene]
         self._camera.lookat[:] = view[0]
         self._camera.distance, self._camera.azimuth, self._camera.elevation = view[1:]
-        self._finger = model.body("finger").id
         self._hexagon = model.mesh("cell").id
         # The compiler turns a mesh onto its principal axes; drawing turns it back.
         turned_back = np.zeros(9)
@@ -79,13 +80,15 @@ class SceneRenderer:
             self._patches.append((span, body, positions[span], rotation))
             self._centres[name] = (body, positions[span].mean(0), normals[span][0])
 
-    def render(self, data: mujoco.MjData, forces: Array, patch: str | None) -> NDArray[np.uint8]:
+    def render(
+        self, data: mujoco.MjData, forces: Array, touching: Mapping[str, Finger]
+    ) -> NDArray[np.uint8]:
         """Draws the scene.
 
         Args:
             data: Simulation, with up-to-date kinematics.
             forces: (cells, 3) skin forces, N.
-            patch: Patch that the finger is at, or None.
+            touching: Patches with a finger at them.
 
         Returns:
             (480, 640, 3) image.
@@ -101,19 +104,21 @@ class SceneRenderer:
             for position, colour in zip(world, colours[span], strict=True):
                 geom = _add(scene, mujoco.mjtGeom.mjGEOM_MESH, np.ones(3), position, turned, colour)
                 geom.dataid = 2 * self._hexagon
-        if patch is not None:
-            self._draw_finger(data, scene, patch)
+        for patch, finger in touching.items():
+            self._draw_finger(data, scene, patch, finger)
         return self._renderer.render()
 
     def close(self) -> None:
         """Frees the OpenGL context."""
         self._renderer.close()
 
-    def _draw_finger(self, data: mujoco.MjData, scene: mujoco.MjvScene, patch: str) -> None:
+    def _draw_finger(
+        self, data: mujoco.MjData, scene: mujoco.MjvScene, patch: str, finger: Finger
+    ) -> None:
         body, centre, normal = self._centres[patch]
         frame = data.xmat[body].reshape(3, 3)
         outward = frame @ normal
-        tip = data.xpos[self._finger].copy()
+        tip = data.xpos[finger.body].copy()
         if tip[2] < 0:
             tip = data.xpos[body] + frame @ centre + outward * (FINGER_RADIUS + _HOVER)
         knuckle, wrist = tip + outward * 0.07, tip + outward * 0.13

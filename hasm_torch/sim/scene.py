@@ -1,6 +1,6 @@
 """The HSR and its surroundings as a MuJoCo model, built from the URDF and the skin file.
 
-    hsr.urdf ──MjSpec──► robot ──+ drives, skin, finger──► "compliance"
+    hsr.urdf ──MjSpec──► robot ──+ drives, skin, fingers──► "compliance"
                                  └─+ table and object──► "grasp"
 
 Names, limits and masses come from the URDF; what is set here is how the joints are driven and
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 SCENES = ("compliance", "grasp")
 TIMESTEP = 0.002  # s
+FINGERS = ("finger", "finger2")  # bodies of thumb and index of the hand that touches
 FINGER_RADIUS = 0.008  # m
 FINGER_MASS = 0.05  # kg
 
@@ -70,8 +71,8 @@ def build_model(scene: str, skin: Skin) -> mujoco.MjModel:
 
     Returns:
         Model with one position actuator for each of the HSR's `JOINTS`, in that order; skin
-        geoms named "skin/<patch>"; a body "finger" on three slides; in "grasp" a free body
-        "object".
+        geoms named "skin/<patch>"; the bodies `FINGERS` on three slides each; in "grasp" a
+        free body "object".
 
     Raises:
         ValueError: The scene is not known.
@@ -87,7 +88,8 @@ def build_model(scene: str, skin: Skin) -> mujoco.MjModel:
     spec.option.impratio = 50  # an object in the hand creeps by 0.03 mm/s
     _add_drives(spec)
     _add_skin(spec, skin)
-    _add_finger(spec)
+    for name in FINGERS:
+        _add_finger(spec, name)
     spec.add_mesh(name="cell", uservert=hexagon_vertices().ravel())
     _add_room(spec)
     if scene == "grasp":
@@ -193,15 +195,15 @@ def _add_skin(spec: mujoco.MjSpec, skin: Skin) -> None:
         )
 
 
-def _add_finger(spec: mujoco.MjSpec) -> None:
-    finger = spec.worldbody.add_body(name="finger", gravcomp=1)
+def _add_finger(spec: mujoco.MjSpec, name: str) -> None:
+    finger = spec.worldbody.add_body(name=name, gravcomp=1)
     for axis in range(3):
         finger.add_joint(
-            name=f"finger/{'xyz'[axis]}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[axis]
+            name=f"{name}/{'xyz'[axis]}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[axis]
         )
     # Frictionless: the skin measures normal forces, the finger gives nothing else.
     finger.add_geom(
-        name="finger",
+        name=name,
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
         size=[FINGER_RADIUS, 0, 0],
         mass=FINGER_MASS,
