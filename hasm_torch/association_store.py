@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from hasm_torch import functional
-from hasm_torch.recall import pack, store, unpack
+from hasm_torch.recall import ROWS, pack, store, unpack
 from hasm_torch.successors import distinct_links, shifted_links
 
 Storage = Literal["float32", "bfloat16", "int8", "bit"]
@@ -68,7 +68,8 @@ class AssociationStore(nn.Module):
         self.code_dim, self.value_dim, self.capacity = code_dim, value_dim, capacity
         self.when_full = when_full
         if self.storage == "bit":
-            associations = torch.zeros_like(pack(torch.empty(capacity, code_dim)))
+            block = pack(torch.empty(1, code_dim))
+            associations = block.new_zeros(-(-capacity // ROWS), *block.shape[1:])
         else:
             associations = torch.zeros(capacity, code_dim, dtype=getattr(torch, self.storage))
         patterns = {"associations": associations, "successors": torch.zeros(capacity, value_dim)}

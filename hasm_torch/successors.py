@@ -90,7 +90,10 @@ def distinct_links(codes: Tensor, episodes: Tensor, resolution: int = 1) -> Dist
         raise ValueError(f"resolution must be at least 1 entry, got {resolution}")
     if len(codes) == 0:
         raise ValueError("no sample to link: expected at least one row in codes")
-    bits = np.packbits((codes > 0).cpu().numpy(), axis=1)
+    # Neighbouring entries go to different parts: with all entries of a joint in each, many codes
+    # would share one.
+    mixed = np.argsort(np.arange(codes.shape[1]) % resolution, kind="stable")
+    bits = np.packbits(np.ascontiguousarray((codes > 0).cpu().numpy()[:, mixed]), axis=1)
     walk = _Walk(bits, resolution)
     labels = episodes.cpu().numpy()
     starts = np.flatnonzero(np.r_[True, labels[1:] != labels[:-1]])

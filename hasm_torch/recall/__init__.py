@@ -1,9 +1,10 @@
 """Softmax recall d = S₋₁ softmax(β Mᵀ q) over dense and packed memories."""
 
 from hasm_torch.recall.dense import Recall, inspect_dense, recall_dense, recall_weights
-from hasm_torch.recall.packed import inspect_packed, pack, recall_packed, store, unpack
+from hasm_torch.recall.packed import ROWS, inspect_packed, pack, recall_packed, store, unpack
 
 __all__ = [
+    "ROWS",
     "Recall",
     "inspect_dense",
     "inspect_packed",

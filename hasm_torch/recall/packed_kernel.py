@@ -6,8 +6,8 @@ softmax is folded into the scan. With h the Hamming distance, the inner product 
 s = D - 2h, so the weight relative to the best match is exp(-2 beta (h - h_min)).
 
 The smallest distance seen so far bounds what the rest may weigh: a row farther than ``slack`` above
-it weighs less than NEGLIGIBLE / K, all such rows together less than NEGLIGIBLE of the whole, so
-blocks whose nearest row lies beyond are passed over without reading their successors.
+it weighs less than NEGLIGIBLE / K, all such rows together less than NEGLIGIBLE of the whole, so a
+block whose nearest row lies beyond is left at the word that shows it, and no successor is read.
 
 Every function takes one pointer, to a job record (JOB_FIELDS), so that a team of threads can run
 it; the threads take the tasks (runs of blocks) from a shared counter.
@@ -236,7 +236,7 @@ def scan(job_pointer):
                 signs = job.signs + 4 * number * width
                 for block in range(first, min(first + group, end_block)):
                     place = job.words + 4 * ROWS * width * (memory * job.blocks + block)
-                    nearest = block_distances(place, signs, width, buffer)
+                    nearest = block_distances(place, signs, width, reach, buffer)
                     if nearest <= reach:
                         first_row = block * ROWS
                         if job.mask != 0 or first_row + ROWS > count:

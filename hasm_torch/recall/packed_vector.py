@@ -10,6 +10,7 @@ here.
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 
 from llvmlite import ir
 from numba import types
@@ -23,39 +24,54 @@ _WORDS, _FLOATS = ir.VectorType(_I32, 16), ir.VectorType(_F32, 16)
 _VALUES = 8  # successor values added at once
 _SUMS = ir.VectorType(_F64, _VALUES)
 _SERIES = [math.log(2) ** power / math.factorial(power) for power in range(8)]  # of 2^x
+_PART = 8  # words of a block between which it may be left
 _CHAINS = 4  # rows added side by side, so that one addition need not wait for the last
 
 
 @intrinsic
-def block_distances(typing_context, block, query, width, out):
+def block_distances(typing_context, block, query, width, reach, out):
     """Hamming distances of a packed query to the 64 associations of a block.
 
-    Args: addresses of the block (int32 (width, 64)) and of the query (int32 (width,)), the width,
-    and the address the distances go to (int32 (64,)).
+    A distance only grows from word to word, so a block is left as soon as all of its associations
+    are out of reach.
 
-    Returns: the smallest distance.
+    Args: addresses of the block (int32 (width, 64)) and of the query (int32 (width,)), the width,
+    the largest distance that matters, and the address the distances go to (int32 (64,)).
+
+    Returns: the smallest distance; if it is beyond the reach, a number that is too.
     """
 
     def emit(context, builder, signature, arguments):
-        block, query, width, out = arguments
+        block, query, width, reach, out = arguments
         count_ones = _llvm(builder, "llvm.ctpop.v16i32", _WORDS, [_WORDS])
         smallest = _llvm(builder, "llvm.vector.reduce.smin.v16i32", _I32, [_WORDS])
         offsets = range(0, 4 * ROWS, 64)
-        with _loop(builder, width, [_same(_WORDS, 0)] * len(offsets)) as (word, sums, totals):
-            bits = builder.load(_at(builder, query, _scaled(builder, word, 4), _I32))
-            query_bits = _spread(builder, bits, _WORDS)
-            line = builder.add(block, _scaled(builder, word, 4 * ROWS))
-            for before, offset in zip(sums, offsets, strict=True):
-                stored = builder.load(_at(builder, line, offset, _WORDS), align=4)
-                ones = builder.call(count_ones, [builder.xor(stored, query_bits)])
-                totals.append(builder.add(before, ones))
-        nearest = totals[0]
-        for total, offset in zip(totals, offsets, strict=True):
+        reach = _spread(builder, builder.trunc(reach, _I32), _WORDS)
+        length = ir.Constant(_I64, _PART)
+        parts = builder.sdiv(builder.add(width, ir.Constant(_I64, _PART - 1)), length)
+        with _loop(builder, parts, [_same(_WORDS, 0)] * len(offsets)) as part_loop:
+            part, before, after = part_loop.turn, part_loop.carried, part_loop.following
+            first = _scaled(builder, part, _PART)
+            left = builder.sub(width, first)
+            words = builder.select(builder.icmp_signed("<", left, length), left, length)
+            with _loop(builder, words, before) as word_loop:
+                word = builder.add(first, word_loop.turn)
+                bits = builder.load(_at(builder, query, _scaled(builder, word, 4), _I32))
+                query_bits = _spread(builder, bits, _WORDS)
+                line = builder.add(block, _scaled(builder, word, 4 * ROWS))
+                for sums, offset in zip(word_loop.carried, offsets, strict=True):
+                    stored = builder.load(_at(builder, line, offset, _WORDS), align=4)
+                    ones = builder.call(count_ones, [builder.xor(stored, query_bits)])
+                    word_loop.following.append(builder.add(sums, ones))
+            after.extend(word_loop.following)
+            in_reach = builder.icmp_signed("<=", _least(builder, after), reach)
+            none = ir.Constant(ir.IntType(_WORDS.count), 0)
+            part_loop.leave = builder.icmp_signed("==", builder.bitcast(in_reach, none.type), none)
+        for total, offset in zip(after, offsets, strict=True):
             builder.store(total, _at(builder, out, offset, _WORDS), align=4)
-            nearest = builder.select(builder.icmp_signed("<", total, nearest), total, nearest)
-        return builder.call(smallest, [nearest])
+        return builder.call(smallest, [_least(builder, after)])
 
-    return types.int32(types.int64, types.int64, types.int64, types.int64), emit
+    return types.int32(*[types.int64] * 5), emit
 
 
 @intrinsic
@@ -137,8 +153,8 @@ def add_weighted_rows(typing_context, weights, successors, rows, stride, values,
         zeros = _same(floats, 0.0)
         pitch = _scaled(builder, stride, 4)
         rounds = builder.sdiv(rows, ir.Constant(_I64, _CHAINS))
-        with _loop(builder, rounds, [zeros] * _CHAINS) as (turn, before, after):
-            row = _scaled(builder, turn, _CHAINS)
+        with _loop(builder, rounds, [zeros] * _CHAINS) as loop:
+            row = _scaled(builder, loop.turn, _CHAINS)
             weight_place = builder.add(weights, _scaled(builder, row, 4))
             place = builder.add(successors, builder.mul(row, pitch))
             for chain in range(_CHAINS):
@@ -149,10 +165,11 @@ def add_weighted_rows(typing_context, weights, successors, rows, stride, values,
                 product = builder.fmul(
                     values, _spread(builder, weight, floats), flags=("contract",)
                 )
-                after.append(builder.fadd(before[chain], product, flags=("contract",)))
+                added = builder.fadd(loop.carried[chain], product, flags=("contract",))
+                loop.following.append(added)
                 place = builder.add(place, pitch)
-        added = after[0]
-        for part in after[1:]:
+        added = loop.following[0]
+        for part in loop.following[1:]:
             added = builder.fadd(added, part)
         target = _at(builder, sums, 0, _SUMS)
         total = builder.fadd(builder.load(target, align=8), builder.fpext(added, _SUMS))
@@ -189,24 +206,47 @@ def _spread(builder: ir.IRBuilder, number: ir.Value, kind: ir.VectorType) -> ir.
     return builder.shuffle_vector(first, empty, _same(lanes, 0))
 
 
+def _least(builder: ir.IRBuilder, vectors: list[ir.Value]) -> ir.Value:
+    """The smaller one in every lane."""
+    least = vectors[0]
+    for vector in vectors[1:]:
+        least = builder.select(builder.icmp_signed("<", vector, least), vector, least)
+    return least
+
+
+@dataclass
+class _Loop:
+    """One turn of a loop: its number, the carried values, those for the next turn.
+
+    Attributes:
+        leave: Condition on which the turn is the last; None for no other than the number.
+    """
+
+    turn: ir.Value
+    carried: list[ir.Value]
+    following: list[ir.Value] = field(default_factory=list)
+    leave: ir.Value | None = None
+
+
 @contextmanager
-def _loop(
-    builder: ir.IRBuilder, times: ir.Value, initial: list[ir.Value]
-) -> Iterator[tuple[ir.Value, list[ir.Value], list[ir.Value]]]:
-    """A loop run at least once: yields the turn, the carried values, a list for the next ones."""
+def _loop(builder: ir.IRBuilder, times: ir.Value, initial: list[ir.Value]) -> Iterator[_Loop]:
+    """A loop run at least once; its last turn's ``following`` are the results."""
     entry = builder.block
     body, end = builder.append_basic_block("body"), builder.append_basic_block("end")
     builder.branch(body)
     builder.position_at_end(body)
-    number = builder.phi(_I64)
-    carried = [builder.phi(value.type) for value in initial]
-    following: list[ir.Value] = []
-    yield number, carried, following
-    next_number = builder.add(number, ir.Constant(_I64, 1))
-    builder.cbranch(builder.icmp_signed("<", next_number, times), body, end)
-    number.add_incoming(ir.Constant(_I64, 0), entry)
-    number.add_incoming(next_number, body)
-    for phi, first, after in zip(carried, initial, following, strict=True):
+    loop = _Loop(builder.phi(_I64), [])
+    loop.carried = [builder.phi(value.type) for value in initial]
+    yield loop
+    next_turn = builder.add(loop.turn, ir.Constant(_I64, 1))
+    again = builder.icmp_signed("<", next_turn, times)
+    if loop.leave is not None:
+        again = builder.and_(again, builder.not_(loop.leave))
+    last = builder.block  # another than ``body`` if a loop lies inside
+    builder.cbranch(again, body, end)
+    loop.turn.add_incoming(ir.Constant(_I64, 0), entry)
+    loop.turn.add_incoming(next_turn, last)
+    for phi, first, after in zip(loop.carried, initial, loop.following, strict=True):
         phi.add_incoming(first, entry)
-        phi.add_incoming(after, body)
+        phi.add_incoming(after, last)
     builder.position_at_end(end)
