@@ -111,11 +111,11 @@ def load_weights(model: "HASM", directory: Path) -> None:
         raise damaged(directory, error) from error
     if not model.memories:
         raise ValueError(f"checkpoint {directory} holds no memory; train it with train.py")
-    for patch, shape in model.shapes.items():
-        count = int(model.memory(patch).memory.count)
+    for name, shape in model.shapes.items():
+        count = int(model.memory(name).memory.count)
         if count != shape.capacity:
             raise ValueError(
-                f"checkpoint {directory}: the memory of {patch} holds {count} associations, "
+                f"checkpoint {directory}: the memory {name} holds {count} associations, "
                 f"expected {shape.capacity}; train again with train.py"
             )
 

@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+SHARED = "shared"  # name of the memory that all patches share
+
 
 @dataclass
 class Body:
@@ -96,6 +98,11 @@ class HASMConfig:
             others where they are; "all" codes and commands every joint.
         touch_levels: "nearest" stores one rate density an episode and recalls at the nearest
             stored one; "exact" uses the rate density of each sample as it is.
+        ranks: Which neurons are ranked together for the N most active: "joint", those of each
+            joint, so that the posture of one does not change the touch code at another; "all".
+        memories: "patch" gives every patch a memory of its own; "shared" stores all in one, which
+            tells patches apart by the rotation of the touch alone.
+        rope: Whether touch codes are rotated (RoPE3D).
         frame: Frame in which the direction of a touch rotates its code: "link", of the link that
             carries the patch, where it is the same in every posture; "base", of the robot's base,
             where it keeps its meaning in space (the bundled HSR's joints only).
@@ -122,6 +129,9 @@ class HASMConfig:
     advance: Literal["spike", "tick"] = "spike"
     code_joints: Literal["moved", "all"] = "moved"
     touch_levels: Literal["nearest", "exact"] = "nearest"
+    ranks: Literal["joint", "all"] = "joint"
+    memories: Literal["patch", "shared"] = "patch"
+    rope: bool = True
     frame: Literal["link", "base"] = "link"
     rebinarise: bool = True
     storage: Literal["float32", "bfloat16", "int8", "bit"] = "bit"
@@ -152,6 +162,7 @@ class HASMConfig:
             advance="tick",
             code_joints="all",
             touch_levels="exact",
+            ranks="all",
             rebinarise=False,
             storage="float32",
             beta=2.0,
@@ -166,11 +177,13 @@ class MemoryShape:
         joints: Indices of the joints that it codes.
         capacity: Associations that it holds.
         touch_levels: Number of stored rate densities.
+        patches: Names of the patches that share the memory; empty where it belongs to one.
     """
 
     joints: list[int]
     capacity: int
     touch_levels: int
+    patches: list[str] = field(default_factory=list)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

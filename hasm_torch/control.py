@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hasm_torch.patch_memory import PatchMemory
 from hasm_torch.skin_encoder import SkinState
+from hasm_torch.skin_filter import FilterState
 
 Array = NDArray[np.float64]
 
@@ -35,10 +36,12 @@ class Goal:
     Attributes:
         positions: (J,) positions of the patch's joints, rad or m.
         pace: Spikes a full joint range.
+        moved: (J,) which of the joints the touch moves.
     """
 
     positions: Array
     pace: float
+    moved: NDArray[np.bool_]
 
 
 @dataclass
@@ -48,11 +51,13 @@ class Walk:
     Attributes:
         reference: (joints,) the joint state asked for, None before the first valid reading.
         goals: The successor that each patch is heading for.
+        levels: Stored rate density that stands for the touch of each patch.
         quiet: Control steps since each patch last spiked.
     """
 
     reference: Array | None = None
     goals: dict[str, Goal] = field(default_factory=dict)
+    levels: dict[str, float] = field(default_factory=dict)
     quiet: dict[str, int] = field(default_factory=dict)
 
 
@@ -64,6 +69,7 @@ class Rollout:
         spikes: Spikes of every patch in the last control steps, (patches,) each.
         density: (patches,) rate density ρ of every patch at the last step.
         touched: Patches with a memory that spiked in the last step.
+        filter: State of what cleans the skin's readings.
         skin: State of the skin's encoder.
         walk: Where the robot is in the memories.
     """
@@ -71,6 +77,7 @@ class Rollout:
     spikes: deque[Array]
     density: Array
     touched: list[str] = field(default_factory=list)
+    filter: FilterState | None = None
     skin: SkinState | None = None
     walk: Walk = field(default_factory=Walk)
 
@@ -88,7 +95,7 @@ def advance(
 
     Args:
         reference: (joints,) joint positions, rad or m.
-        walk: Holds the patch's goal between calls.
+        walk: Holds the patch's goal and touch level between calls.
         patch: Name of the patch.
         memory: The patch's memory.
         spikes: Spikes to spend.
@@ -99,16 +106,17 @@ def advance(
         (joints,) the moved reference; joints that the memory does not code stay.
     """
     coded = reference[memory.coded]
+    level = walk.levels[patch] = memory.touch_level(density, walk.levels.get(patch))
     for _ in range(RECALLS_A_STEP):
         goal = walk.goals.get(patch)
         if goal is None:
-            goal = walk.goals[patch] = Goal(*memory.follow(coded, density, link))
-        way = goal.positions - coded
+            goal = walk.goals[patch] = Goal(*memory.follow(coded, level, link, patch))
+        way = np.where(goal.moved, goal.positions - coded, 0.0)
         needed = goal.pace * float(np.abs(way / memory.span).max())
         if needed > spikes:
             coded = coded + way * (spikes / needed)
             break
-        coded, spikes = goal.positions, spikes - needed
+        coded, spikes = np.where(goal.moved, goal.positions, coded), spikes - needed
         del walk.goals[patch]
         if needed == 0 or spikes == 0:
             break

@@ -15,12 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from hasm_torch import checkpoint
-from hasm_torch.config import Body, HASMConfig, MemoryShape
+from hasm_torch.config import SHARED, Body, HASMConfig, MemoryShape
 from hasm_torch.control import Array, Rollout, Walk, advance, limit_speed
 from hasm_torch.learning import FitReport, Recording, learn
 from hasm_torch.patch_memory import PatchMemory
 from hasm_torch.readings import forces_of
 from hasm_torch.skin_encoder import SkinEncoder, spike_step
+from hasm_torch.skin_filter import FilterState, clean_skin
 
 if TYPE_CHECKING:
     from hasm_torch.robot import Kinematics
@@ -30,16 +31,19 @@ ONSET_AFTER = 0.2
 
 
 class HASM(nn.Module):
-    """Encoders and one dedicated memory a skin patch.
+    """Encoders and one dedicated memory a skin patch, or one that all patches share.
 
     ``fit`` stores episodes, ``step`` gives the joint target of one control step, ``reset`` starts
     a new rollout.
 
     Attributes:
-        memories: The patches that have learned something, by name.
+        memories: The memories that hold something: one a patch, by its name, or the shared one.
+        patches: Names of the patches that have learned something.
         rollout: The control loop that ``step`` goes on with unless it is given another.
         tolerance: (joints,) how far a joint may be from its reference before the reference waits
             or, at a new touch, follows the joint, rad or m.
+        footprint: (cells,) share of its patch's force that each cell took at every touch of the
+            episodes, see ``skin_filter``.
 
     Args:
         config: Settings of the method.
@@ -48,6 +52,7 @@ class HASM(nn.Module):
     """
 
     tolerance: Tensor
+    footprint: Tensor
     lower: Tensor
     upper: Tensor
     max_speed: Tensor
@@ -79,20 +84,35 @@ class HASM(nn.Module):
             for limit in (body.lower, body.upper, body.max_speed)
         )
         self.register_buffer("tolerance", 0.1 * (self.upper - self.lower))
+        self.register_buffer("footprint", torch.zeros(sum(body.cells)))
         self.reset()
 
-    def add_memory(self, patch: str, shape: MemoryShape) -> PatchMemory:
-        """Give a patch an empty memory, in place of the one it had."""
-        if patch not in self.body.patches:
-            raise ValueError(f"unknown patch {patch!r}, valid: {', '.join(self.body.patches)}")
-        index = self.body.patches.index(patch)
+    def add_memory(self, name: str, shape: MemoryShape) -> PatchMemory:
+        """Make an empty memory, in place of the one of that name.
+
+        Args:
+            name: The patch that it belongs to, or ``SHARED`` where the shape names the patches.
+            shape: What it holds.
+
+        Raises:
+            ValueError: If a patch is not the body's.
+        """
+        for served in shape.patches or [name]:
+            if served not in self.body.patches:
+                raise ValueError(f"unknown patch {served!r}, valid: {', '.join(self.body.patches)}")
+        index = 0 if shape.patches else self.body.patches.index(name)
         memory = PatchMemory(self.config, self.body, index, shape)
-        self.shapes[patch], self.memories[patch] = shape, memory
+        self.shapes[name], self.memories[name] = shape, memory
         return memory
+
+    @property
+    def patches(self) -> list[str]:
+        """Names of the patches that have learned something."""
+        return [patch for name, shape in self.shapes.items() for patch in shape.patches or [name]]
 
     def memory(self, patch: str) -> PatchMemory:
         """The memory of a patch that has learned something."""
-        memory = self.memories[patch]
+        memory = self.memories[SHARED if SHARED in self.memories else patch]
         assert isinstance(memory, PatchMemory)
         return memory
 
@@ -140,6 +160,23 @@ class HASM(nn.Module):
         self.reset()
         return report
 
+    def clean(
+        self, forces: Tensor, state: FilterState | None = None
+    ) -> tuple[Tensor, FilterState | None]:
+        """What a sound skin would have read, see ``skin_filter``.
+
+        Args:
+            forces: (T, cells, 3), N.
+            state: What an earlier chunk returned.
+
+        Returns:
+            (T, cells, 3), N; the state to go on from.
+        """
+        if not self.body.channels:
+            return forces, None
+        footprint = self.footprint.cpu().numpy()
+        return clean_skin(forces, self.body.cells, self.body.rate, footprint, state)
+
     def reset(self) -> None:
         """Forget the rollout: the next step starts from the measured joints."""
         self.rollout = self.new_rollout()
@@ -179,21 +216,23 @@ class HASM(nn.Module):
         if not (known and bool(torch.isfinite(forces).all())):
             rollout.touched = []
             return self._target(walk.reference, state)
-        spikes, _, rollout.skin = self.skin(forces.unsqueeze(0), rollout.skin)
+        felt, rollout.filter = self.clean(forces.unsqueeze(0), rollout.filter)
+        spikes, _, rollout.skin = self.skin(felt, rollout.skin)
         counts = spikes[0].cpu().numpy().astype(np.float64)
         rollout.spikes.append(counts)
         rollout.density = density = self._density(rollout.spikes)
+        patches = self.patches
         rollout.touched = touched = [
             patch
             for patch, count in zip(self.body.patches, counts)
-            if count > 0 and patch in self.memories
+            if count > 0 and patch in patches
         ]
         self._note_onsets(walk, touched, measured)
         target = walk.reference
         for patch in touched:
             index = self.body.patches.index(patch)
-            felt = (float(counts[index]), float(density[index]))
-            target = self._move(walk, target, patch, *felt, measured)
+            touch = (float(counts[index]), float(density[index]))
+            target = self._move(walk, target, patch, *touch, measured)
         if touched:
             target = limit_speed(walk.reference, target, self._max_speed, 1.0 / self.body.rate)
             walk.reference = np.clip(target, self._lower, self._upper)
@@ -233,7 +272,10 @@ class HASM(nn.Module):
         if self.config.advance == "tick":
             link = self.link_rotation(patch, torch.from_numpy(measured))
             moved = reference.copy()
-            moved[memory.coded], _ = memory.follow(measured[memory.coded], density, link)
+            level = memory.touch_level(density)
+            now = measured[memory.coded]
+            following, _, led = memory.follow(now, level, link, patch)
+            moved[memory.coded] = np.where(led, following, moved[memory.coded])
             return moved
         lag = np.abs(measured - reference)[memory.coded]
         if (lag > self.tolerance.cpu().numpy()[memory.coded]).any():
@@ -254,7 +296,10 @@ class HASM(nn.Module):
         for patch in list(walk.goals):
             if touched and patch not in touched:
                 del walk.goals[patch]  # another patch leads away from this goal
-        for patch in self.memories:
+        for patch in touched:
+            if walk.quiet.get(patch, onset) >= onset:
+                walk.levels.pop(patch, None)  # how strong the new touch is shows later
+        for patch in self.patches:
             walk.quiet[patch] = 0 if patch in touched else walk.quiet.get(patch, 0) + 1
 
     def _density(self, spikes: deque[Array]) -> Array:

@@ -38,7 +38,14 @@ def block_rotations(dim: int, axis: Tensor, angle: Tensor) -> Tensor:
 
 
 def encode_query(
-    positions: Tensor, density: Tensor, coder: PlaceCode, rotations: Tensor, rebinarise: bool
+    positions: Tensor,
+    density: Tensor,
+    coder: PlaceCode,
+    ranked: int,
+    keys: Tensor,
+    key_of: Tensor,
+    rotations: Tensor,
+    rebinarise: bool,
 ) -> tuple[Tensor, Tensor]:
     """State code s and rotated touch code o of queries.
 
@@ -46,6 +53,9 @@ def encode_query(
         positions: (..., J) joint positions, rad or m, finite.
         density: (...,) rate density ρ, 0 to 1.
         coder: The place code.
+        ranked: Neurons that are ranked together for the touch code: all, or one joint's.
+        keys: (L, D) ±1, with one of which the touch code is bound before it is rotated.
+        key_of: (...,) which one, int64.
         rotations: (blocks, 3, 3) of ``block_rotations``.
         rebinarise: Whether the rotated code returns to ±1.
 
@@ -65,6 +75,9 @@ def encode_query(
         coder.bits,
         coder.width,
         CODES.index(coder.code),
+        ranked,
+        keys.numpy(),
+        key_of.expand(leading).reshape(-1).contiguous().numpy(),
         rotations.numpy(),
         rebinarise,
         state,
@@ -83,13 +96,14 @@ def _compiled() -> Callable[..., None]:
 
     def kernel(
         positions: Any, density: Any, lower: Any, upper: Any, neurons: int, bits: int,
-        width: float, code: int, rotations: Any, rebinarise: bool, state: Any, touch: Any,
+        width: float, code: int, ranked: int, keys: Any, key_of: Any, rotations: Any,
+        rebinarise: bool, state: Any, touch: Any,
     ) -> None:  # fmt: skip
         rows, joints = positions.shape
         total = joints * neurons
         highest = bits if code == thermometer else 2**bits - 1
         levels = np.empty(total, np.int64)
-        counts = np.empty(highest + 1, np.int64)
+        counts = np.empty((total // ranked, highest + 1), np.int64)
         for row in range(rows):
             counts[:] = 0
             for joint in range(joints):
@@ -104,24 +118,26 @@ def _compiled() -> Callable[..., None]:
                         level = int(np.rint(rate * 255)) >> (8 - bits)
                     index = joint * neurons + neuron
                     levels[index] = level
-                    counts[level] += 1
+                    counts[index // ranked, level] += 1
                     word = level ^ (level >> 1) if code == gray else level
                     for bit in range(bits):
                         on = level > bit if code == thermometer else word >> bits - 1 - bit & 1 == 1
                         state[row, index * bits + bit] = 1.0 if on else -1.0
-            # N = round(ρ N_n N_J) most active neurons; of equal ones those of lower index
-            wanted = int(np.rint(density[row] * np.float32(total)))
-            cut = highest
-            while cut >= 0 and wanted > counts[cut]:
-                wanted -= counts[cut]
-                cut -= 1
-            for index in range(total):
-                active = levels[index] > cut
-                if levels[index] == cut and wanted > 0:
-                    active = True
-                    wanted -= 1
-                for bit in range(bits):
-                    touch[row, index * bits + bit] = 1.0 if active else -1.0
+            key = keys[key_of[row]]
+            # N = round(ρ M) most active of M neurons; of equal ones those of lower index
+            for group in range(len(counts)):
+                wanted = int(np.rint(density[row] * np.float32(ranked)))
+                cut = highest
+                while cut >= 0 and wanted > counts[group, cut]:
+                    wanted -= counts[group, cut]
+                    cut -= 1
+                for index in range(group * ranked, (group + 1) * ranked):
+                    active = levels[index] > cut
+                    if levels[index] == cut and wanted > 0:
+                        active = True
+                        wanted -= 1
+                    for bit in range(index * bits, (index + 1) * bits):
+                        touch[row, bit] = key[bit] if active else -key[bit]
             for block in range(len(rotations)):  # eq. rope3d1
                 turn = rotations[block]
                 x, y, z = (

@@ -166,7 +166,7 @@ def _load_libraries() -> None:
 
     body = Body(["joint"], [0.0], [1.0], [1.0], ["patch"], [1], [[1.0, 0.0, 0.0]])
     model = HASM(HASMConfig(), body)
-    model.skin(torch.zeros(1, 1, 3))
+    model.skin(model.clean(torch.zeros(1, 1, 3))[0])
     memory = model.add_memory("patch", MemoryShape([0], 1, 0))
     one = torch.zeros(1)
     memory.write(one.unsqueeze(0), one, one.unsqueeze(0), one)

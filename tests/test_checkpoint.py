@@ -40,9 +40,10 @@ def saved(original, tmp_path):
         HASMConfig(storage="int8"),
         HASMConfig(storage="bfloat16"),
         HASMConfig(storage="float32", rebinarise=False),
+        HASMConfig(memories="shared"),
         HASMConfig.literal(),
     ],
-    ids=["bit", "int8", "bfloat16", "float32", "literal"],
+    ids=["bit", "int8", "bfloat16", "float32", "shared", "literal"],
 )
 def test_a_loaded_model_takes_identical_steps(tmp_path, config):
     model = fitted(config)

@@ -17,10 +17,13 @@ class Line:
         self.coded, self.span = np.array([0, 2]), UPPER - LOWER
         self.places, self.pace, self.recalls = np.array(places), pace, 0
 
-    def follow(self, positions, density, link=None):
+    def touch_level(self, density, held=None):
+        return density
+
+    def follow(self, positions, density, link=None, patch=None):
         self.recalls += 1
         nearest = int(np.abs(self.places - positions).sum(-1).argmin())
-        return self.places[min(nearest + 1, len(self.places) - 1)], self.pace
+        return self.places[min(nearest + 1, len(self.places) - 1)], self.pace, np.ones(2, bool)
 
 
 def steps(memory: Line, spikes: list[float]) -> torch.Tensor:

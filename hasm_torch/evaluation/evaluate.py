@@ -195,7 +195,7 @@ def time_steps(model: HASM, steps: int = TIMED_STEPS) -> dict[str, float]:
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    patch = next(iter(model.memories))
+    patch = model.patches[0]
     index = model.body.patches.index(patch)
     first = sum(model.body.cells[:index])
     skin = torch.zeros(sum(model.body.cells), 3)

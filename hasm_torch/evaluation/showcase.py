@@ -11,7 +11,6 @@ from hasm_torch.evaluation.grasp import GraspCase
 from hasm_torch.evaluation.rollout import Array, roll_out
 from hasm_torch.evaluation.runner import make_env, run_case
 from hasm_torch.hasm import HASM
-from hasm_torch.patch_memory import PatchMemory
 from hasm_torch.rerun_recording import Scenes, cell_places, write_recording
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.poses import START_POSES
@@ -92,7 +91,7 @@ def draw_grasp(model: HASM, seed: int, directory: Path) -> list[Path]:
     case = GraspCase(seed, 2, 0.05, 0.01, 7.0)
     trace, _ = run_case("grasp", case, env, model, watch=watch)
     path = directory / "recall_weights.png"
-    plots.plot_recall(path, trace.time, recalled, sorted(model.memories))
+    plots.plot_recall(path, trace.time, recalled, sorted(model.patches))
     env.close()
     return [path]
 
@@ -138,12 +137,11 @@ def _weights(model: HASM) -> tuple[str, Array] | None:
     touched = model.touched
     if not touched:
         return None
-    memory = model.memories[touched[0]]
-    assert isinstance(memory, PatchMemory)
+    memory = model.memory(touched[0])
     positions = model.reference[memory.joints]
     density = model.density[model.body.patches.index(touched[0])]
     link = model.link_rotation(touched[0], model.reference)
-    return touched[0], memory.weights(positions, density, link).double().numpy()
+    return touched[0], memory.weights(positions, density, link, touched[0]).double().numpy()
 
 
 def film(experiment: str, model: HASM, seed: int, directory: Path) -> Path:

@@ -176,12 +176,12 @@ class HASMPolicy(PreTrainedPolicy):
             raise RuntimeError("nothing was learned yet, so there is nothing to recall")
         errors = []
         spikes, density = self._felt(data, batch)
-        for patch in self.model.memories:
+        for patch in self.model.patches:
             memory, index = self.model.memory(patch), self.model.body.patches.index(patch)
             rows = torch.nonzero(spikes[:, index] > 0).flatten()
             state, action = batch[STATE][rows], batch[ACTION][rows]
             link = self.model.link_rotation(patch, state)
-            recalled, _ = memory(state[:, memory.joints], density[rows, index], link)
+            recalled, _ = memory(state[:, memory.joints], density[rows, index], link, patch)
             errors.append((recalled - action[:, memory.joints]).abs().flatten())
         found = torch.cat(errors)
         return found.mean() if len(found) else self.anchor.new_zeros(())

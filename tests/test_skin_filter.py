@@ -1,0 +1,154 @@
+"""A sound skin passes unchanged; a damaged one is told from a touched one."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hasm_torch.skin_filter import HOLD_S, Footprint, clean_skin
+
+CELLS, RATE = [7, 7, 7, 7, 6, 5], 50.0
+TOTAL = sum(CELLS)
+HELD = round(HOLD_S * RATE)
+NOTHING = np.zeros(TOTAL, np.float32)
+SHARES = np.array([0.93, *[0.07 / 6] * 6])
+
+
+def clean(skin: torch.Tensor, footprint: np.ndarray = NOTHING) -> torch.Tensor:
+    return clean_skin(skin, CELLS, RATE, footprint)[0]
+
+
+def touched(force: np.ndarray, patch: int = 1) -> torch.Tensor:
+    """Forces (T,) N on a patch of seven cells, spread as by an elastomer: (T, C, 3)."""
+    skin = np.zeros((len(force), TOTAL, 3), np.float32)
+    first = sum(CELLS[:patch])
+    skin[:, first : first + 7] = (force[:, None] * SHARES / 3)[..., None]
+    return torch.from_numpy(skin)
+
+
+def push(samples: int, force: float, seed: int = 0) -> np.ndarray:
+    """A push that begins after 10 samples and varies as a hand does, (T,) N."""
+    rng = np.random.default_rng(seed)
+    course = force * (1 + 0.2 * np.sin(np.arange(samples) / rng.uniform(5, 12)))
+    return np.where(np.arange(samples) < 10, 0.0, course)
+
+
+def newtons(skin: torch.Tensor) -> np.ndarray:
+    """Force of each patch, (T, patches) N."""
+    return torch.stack([p.abs().sum((1, 2)) for p in skin.split(CELLS, dim=1)], 1).numpy()
+
+
+FOOTPRINT_SKIN = Footprint(CELLS)
+for _patch in range(4):
+    FOOTPRINT_SKIN.add(touched(push(60, 8.0), _patch))
+FOOTPRINT = FOOTPRINT_SKIN.shares().numpy()
+
+
+@given(forces=st.lists(st.floats(0.05, 14.0), min_size=1, max_size=3), patch=st.integers(0, 2),
+       seed=st.integers(0, 99))  # fmt: skip
+@settings(max_examples=20, deadline=None)
+def test_a_sound_skin_passes_to_the_last_bit(forces, patch, seed):
+    skin = sum(touched(push(80, force, seed + i), patch + i % 2) for i, force in enumerate(forces))
+    assert torch.equal(clean(skin, FOOTPRINT), skin)
+
+
+@given(parts=st.lists(st.integers(0, 9), min_size=1, max_size=5), seed=st.integers(0, 99))
+@settings(max_examples=20, deadline=None)
+def test_chunks_equal_the_whole(parts, seed):
+    rng = np.random.default_rng(seed)
+    skin = touched(push(sum(parts), 6.0, seed))
+    skin = (skin + 0.3 * torch.from_numpy(rng.standard_normal(skin.shape)).float()).clamp(min=0)
+    skin[rng.random(len(skin)) < 0.2] = 0.0
+    state, pieces = None, []
+    for chunk in skin.split(parts):
+        piece, state = clean_skin(chunk, CELLS, RATE, FOOTPRINT, state)
+        pieces.append(piece)
+    assert torch.equal(torch.cat(pieces), clean(skin, FOOTPRINT))
+
+
+def test_lost_samples_repeat_the_last_one_and_a_release_comes_through():
+    skin = touched(push(60, 8.0))
+    gaps = skin.clone()
+    gaps[20 : 20 + HELD] = 0.0
+    gaps[40] = 0.0
+    held = clean(gaps)
+    assert torch.equal(held[20 : 20 + HELD], skin[19].expand(HELD, -1, -1))
+    assert torch.equal(held[40], skin[39])
+    gaps[45:] = 0.0
+    released = clean(gaps)
+    assert not released[45 + HELD :].any()
+
+
+@pytest.mark.parametrize("level", [0.1, 0.5, 2.0])
+def test_noise_alone_is_no_touch(level):
+    rng = np.random.default_rng(0)
+    false = 0
+    for _ in range(5):
+        noise = level * rng.standard_normal((400, TOTAL, 3))
+        false += int((newtons(clean(torch.from_numpy(noise.clip(0)).float())) > 0).sum())
+    assert false < 0.002 * 5 * 400 * len(CELLS)
+
+
+@pytest.mark.parametrize(("level", "force"), [(0.1, 2.0), (0.5, 3.0), (2.0, 10.0)])
+def test_a_touch_under_noise_keeps_its_strength_and_its_patch(level, force):
+    rng = np.random.default_rng(1)
+    course = push(300, force)
+    noisy = touched(course) + level * torch.from_numpy(rng.standard_normal((300, TOTAL, 3))).float()
+    felt = newtons(clean(noisy.clamp(min=0), FOOTPRINT))[30:]
+    assert felt[:, 1].mean() == pytest.approx(course[30:].mean(), rel=0.25)
+    others = np.delete(felt, 1, axis=1)
+    assert (others > 0).mean() < 0.002
+
+
+def test_an_offset_of_the_whole_skin_is_taken_out():
+    skin = touched(push(100, 5.0)) + 0.2
+    felt = newtons(clean(skin, FOOTPRINT))
+    np.testing.assert_allclose(felt, newtons(skin - 0.2), atol=1e-4)
+
+
+def test_a_body_of_few_patches_may_be_held_all_over():
+    cells = [4, 4, 4]
+    skin = torch.full((50, 12, 3), 0.5)
+    cleaned, _ = clean_skin(skin, cells, RATE, np.zeros(12, np.float32))
+    assert torch.equal(cleaned, skin)
+
+
+@pytest.mark.parametrize("dead", [[0], [0, 3], [0, 1, 4], [2, 5]])
+def test_dead_cells_take_their_share_again(dead):
+    skin = touched(push(100, 8.0, 3))
+    broken = skin.clone()
+    broken[:, [CELLS[0] + cell for cell in dead]] = 0.0
+    expected, felt = newtons(skin)[:, 1], newtons(clean(broken, FOOTPRINT))[:, 1]
+    np.testing.assert_allclose(felt, expected, rtol=0.01)
+    assert (newtons(clean(broken))[20:, 1] < 0.99 * expected[20:]).all()  # not without a footprint
+
+
+def test_a_touch_beside_the_usual_place_is_not_taken_for_a_dead_cell():
+    skin = torch.zeros(40, TOTAL, 3)
+    place = CELLS[0] + 1
+    skin[10:, place] = 5.0 / 3
+    skin[10:, [CELLS[0], place + 1, place + 5]] = 0.05 / 3
+    felt, real = newtons(clean(skin, FOOTPRINT))[:, 1], newtons(skin)[:, 1]
+    assert (felt <= 1.2 * real).all()
+
+
+def test_a_footprint_leaves_out_cells_that_a_touch_may_miss():
+    estimate = Footprint(CELLS)
+    skin = touched(push(50, 8.0), 0)
+    estimate.add(skin)
+    np.testing.assert_allclose(estimate.shares()[:7], SHARES, rtol=1e-4)
+    beside = skin.clone()
+    beside[:, 4] = 0.0
+    estimate.add(beside)
+    shares = estimate.shares()
+    assert shares[4] == 0
+    assert (shares[[0, 1, 2, 3, 5, 6]] > 0).all()
+    assert not shares[7:].any()  # never touched
+
+
+def test_shapes_are_checked():
+    with pytest.raises(ValueError, match=r"expected skin \(T, 39, 3\)"):
+        clean_skin(torch.zeros(5, 38, 3), CELLS, RATE, NOTHING)
+    with pytest.raises(ValueError, match=r"footprint \(39,\)"):
+        clean_skin(torch.zeros(5, TOTAL, 3), CELLS, RATE, NOTHING[:-1])
