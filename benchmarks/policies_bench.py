@@ -4,7 +4,7 @@ import json
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -14,18 +14,28 @@ import numpy as np
 import torch
 
 from benchmarks.baselines.contestants import Trained, train
+from benchmarks.baselines.crowd import crowded
+from benchmarks.baselines.crowd_measures import margin, step_times
 from benchmarks.baselines.faults import Fault, FaultySkin, Kind
+from benchmarks.baselines.learned_training import Training
 from hasm_torch.config import Body
-from hasm_torch.evaluation import compliance, grasp
-from hasm_torch.evaluation.rollout import Policy
+from hasm_torch.evaluation import combined, compliance, grasp
+from hasm_torch.evaluation.rollout import Array, Policy
 from hasm_torch.evaluation.runner import EXPERIMENTS, make_env, run_case
+from hasm_torch.hasm import HASM
 from hasm_torch.lerobot.body import body_of
 from hasm_torch.lerobot.episodes import Episode, load_episodes
-from hasm_torch.lerobot.human_env import MOVED, STAYED
+from hasm_torch.robot import JOINTS
+from hasm_torch.sim.demonstrator import POSTURE, compliance_episodes, grasp_episodes
+from hasm_torch.sim.poses import START_POSES
 
 START_NOISE = 0.05  # rad, where it is not varied
 OBJECT_NOISE, PAUSES = 0.01, 3
 TIMED_STEPS = 300
+# What few and many demonstrations are drawn from: ten episodes a behaviour.
+POOL_FORCES = tuple(float(f) for f in np.linspace(3.0, 10.0, 10))  # N
+POOL_SEED = 1
+CROWD_LENGTH = 115  # samples of an unrelated motion; some 100 of them are states of their own
 
 
 @dataclass(frozen=True)
@@ -34,11 +44,12 @@ class Cell:
 
     Attributes:
         contestant: Who.
-        condition: "none" in the table; in the curves "unharmed", a fault of the skin,
-            "start_noise" or "demonstrations".
+        condition: "none" in the table; in the curves "unharmed" or one of
+            ``benchmarks.policies_report.CONDITIONS``.
         level: How much of it.
-        seed: Seed of rollouts, faults and the choice of demonstrations.
-        behaviour_rollouts: Evenly pressed compliance rollouts a behaviour; 0 makes none.
+        seed: Seed of rollouts, faults, unrelated motions and the choice of demonstrations.
+        behaviour_rollouts: Evenly pressed compliance rollouts a behaviour (pairs of patches in
+            "between"); 0 makes none.
         grasps: Grasps; 0 makes none.
     """
 
@@ -60,9 +71,11 @@ class Bench:
 
     Args:
         datasets: Folder of the bundled datasets.
+        training: How networks are trained.
     """
 
-    def __init__(self, datasets: Path) -> None:
+    def __init__(self, datasets: Path, training: Training) -> None:
+        self.training = training
         self.episodes: dict[str, list[Episode]] = {}
         self.body: dict[str, Body] = {}
         self.env: dict[str, Any] = {}
@@ -71,6 +84,7 @@ class Bench:
             self.episodes[experiment], self.body[experiment] = data.episodes, body_of(data)
             self.env[experiment] = make_env(experiment)
         self.trained = cache(self._train)
+        self.pool = cache(_pool)
         train("default", "compliance", self.body["compliance"], self.episodes["compliance"][:1])
 
     def close(self) -> None:
@@ -93,43 +107,111 @@ class Bench:
     def _run(self, cell: Cell, experiment: str) -> dict[str, Any]:
         picked = tuple(range(len(self.episodes[experiment])))
         if cell.condition == "demonstrations":
-            picked = some_episodes(self.episodes[experiment], int(cell.level), cell.seed)
-        trained = self.trained(cell.contestant, experiment, picked)
-        policy: Policy = trained.policy
+            picked = some_episodes(self.pool(experiment), int(cell.level), cell.seed)
+        trained = self.trained(
+            cell.contestant, experiment, picked, cell.condition == "demonstrations"
+        )
+        policy = trained.policy
+        more: dict[str, Any] = {}
+        if cell.condition == "crowding" and cell.level:
+            policy, more = self._crowd(trained.policy, experiment, cell)
+        rolled: Policy = policy
         if cell.condition in get_args(Kind):
             fault = Fault(cell.condition, cell.level)  # type: ignore[arg-type]  # it checks
-            policy = FaultySkin(policy, fault, np.random.default_rng(cell.seed))
+            rolled = FaultySkin(policy, fault, np.random.default_rng(cell.seed))
+        return {
+            **self._roll_out(cell, experiment, rolled),
+            "train_seconds": trained.seconds,
+            "memory_bytes": policy.memory_bytes(),
+            "step_ms": step_ms(policy, self.body[experiment]),
+            "notes": trained.notes,
+            **more,
+        }
+
+    def _roll_out(self, cell: Cell, experiment: str, policy: Policy) -> dict[str, Any]:
+        """The figures of the rollouts, as ``eval.py`` computes them."""
+        env = self.env[experiment]
+        if cell.condition == "between":
+            pairs = combined.cases(cell.behaviour_rollouts, cell.seed)
+            figures = [combined.run_case(case, env, policy)[1] for case in pairs]
+            won = [figure["success"] for figure in figures]
+            return {**combined.summarise(figures), "successes": sum(won), "rollouts": len(won)}
         planned = plan(cell, experiment)
-        figures = [run_case(experiment, c, self.env[experiment], policy)[1] for c in planned]
+        starts = [start_of(cell, case, env) for case in planned]
+        figures = [
+            run_case(experiment, case, env, policy, start=start)[1]
+            for case, start in zip(planned, starts)
+        ]
         if experiment == "compliance":
             summary = compliance.summarise(planned, figures)
             for behaviour in summary["behaviours"].values():
                 del behaviour["velocities"]
-            won = [f["displacement"] > MOVED and f["others"] < STAYED for f in figures]
+            won = [compliance.succeeded(figure) for figure in figures]
         else:
             summary = grasp.summarise(figures)
             del summary["results"]
-            won = [f["success"] for f in figures]
-        return summary | {
-            "successes": sum(won),
-            "rollouts": len(won),
-            "train_seconds": trained.seconds,
-            "memory_bytes": trained.policy.memory_bytes(),
-            "step_ms": step_ms(trained.policy, self.body[experiment]),
-            "notes": trained.notes,
+            won = [figure["success"] for figure in figures]
+        return {**summary, "successes": sum(won), "rollouts": len(won)}
+
+    def _train(
+        self, contestant: str, experiment: str, picked: tuple[int, ...], from_pool: bool
+    ) -> Trained:
+        episodes = self.pool(experiment) if from_pool else self.episodes[experiment]
+        chosen = [episodes[i] for i in picked]
+        return train(contestant, experiment, self.body[experiment], chosen, self.training)
+
+    def _crowd(self, model: Any, experiment: str, cell: Cell) -> tuple[HASM, dict[str, Any]]:
+        """The model with unrelated motions in each of its memories, and what they do to it."""
+        rng = np.random.default_rng(cell.seed)
+        begin = time.perf_counter()
+        episodes = self.episodes[experiment]
+        full = crowded(model, episodes, int(cell.level), CROWD_LENGTH, rng)
+        seconds = time.perf_counter() - begin
+        leads = {
+            patch: margin(full.model.memory(patch).memory, stored.learned)._asdict()
+            for patch, stored in full.stored.items()
+        }
+        times = step_times(full.model, torch.tensor(START_POSES["grasp"]))
+        return full.model, {
+            "crowding_seconds": seconds,
+            "stored": {patch: asdict(stored) for patch, stored in full.stored.items()},
+            "margins": leads,
+            "step_times": times._asdict(),
         }
 
-    def _train(self, contestant: str, experiment: str, picked: tuple[int, ...]) -> Trained:
-        episodes = [self.episodes[experiment][i] for i in picked]
-        return train(contestant, experiment, self.body[experiment], episodes)
+
+def _pool(experiment: str) -> list[Episode]:
+    """Ten episodes of each behaviour, recorded anew."""
+    if experiment == "compliance":
+        return list(compliance_episodes(POOL_FORCES))
+    return list(grasp_episodes(len(POOL_FORCES), POOL_SEED))
 
 
 def plan(cell: Cell, experiment: str) -> list[Any]:
     """The rollouts of a cell."""
+    forces = [cell.level] if cell.condition == "force" else []
     if experiment == "compliance":
-        return compliance.cases(cell.behaviour_rollouts, [], cell.seed)
+        return compliance.cases(cell.behaviour_rollouts, forces, cell.seed)
     noise = cell.level if cell.condition == "start_noise" else START_NOISE
-    return grasp.cases(cell.grasps, [], cell.seed, PAUSES, noise, OBJECT_NOISE)
+    place = cell.level if cell.condition == "object" else OBJECT_NOISE
+    return grasp.cases(cell.grasps, forces, cell.seed, PAUSES, noise, place)
+
+
+def start_of(cell: Cell, case: Any, env: Any) -> Array | None:
+    """Start posture of a rollout, (joints,) rad or m; None for the case's own.
+
+    "posture" moves the joints that do not yield from the posture of the demonstrations towards
+    the case's own by its level.
+    """
+    if cell.condition != "posture":
+        return None
+    lower, upper = env.unwrapped.joint_lower, env.unwrapped.joint_upper
+    start = compliance.start_posture(case, JOINTS, lower, upper)
+    shown = lower + np.array(POSTURE) * (upper - lower)
+    yielding = JOINTS.index(compliance.BEHAVIOURS[case.behaviour].joint)
+    mixed = shown + cell.level * (start - shown)
+    mixed[yielding] = start[yielding]
+    return mixed
 
 
 def some_episodes(episodes: Sequence[Episode], number: int, seed: int) -> tuple[int, ...]:
@@ -143,7 +225,10 @@ def some_episodes(episodes: Sequence[Episode], number: int, seed: int) -> tuple[
 
 
 def step_ms(policy: Policy, body: Body) -> float:
-    """Median time of a control step under a touch of 8 N at the first patch, ms."""
+    """Mean time of a control step under a touch of 8 N at the first patch, ms.
+
+    The mean, since some policies plan seldom and long.
+    """
     state = (torch.tensor(body.lower) + torch.tensor(body.upper)) / 2
     skin = torch.zeros(sum(body.cells), 3)
     skin[3] = 8.0 / 3
@@ -154,4 +239,4 @@ def step_ms(policy: Policy, body: Body) -> float:
         state = policy.step(state, skin)
         spent.append(1e3 * (time.perf_counter() - begin))
     policy.reset()
-    return statistics.median(spent)
+    return statistics.mean(spent)

@@ -1,22 +1,32 @@
-"""Table, intervals and figures of ``benchmarks.policies``."""
+"""Tables, intervals and goals of ``benchmarks.policies``."""
 
 import math
-from pathlib import Path
+import statistics
 from typing import Any
 
 from hasm_torch.evaluation.runner import EXPERIMENTS
 
 CONDITIONS = {
+    "force": "force of the touch, N",
+    "posture": "posture, from shown to any",
+    "between": "two patches at once",
+    "start_noise": "noise of the start, rad",
+    "object": "object moved by up to, m",
+    "demonstrations": "episodes a behaviour",
     "dead": "dead cells, share",
     "noise": "noise, N a point",
     "lost": "lost samples, share",
     "offset": "constant offset, N a point",
     "stuck": "a stuck cell, N a point",
-    "start_noise": "noise of the start, rad",
-    "demonstrations": "episodes a behaviour",
+    "crowding": "unrelated motions stored",
 }
-# Where a curve's unharmed point lies on its axis.
-UNHARMED = {"start_noise": 0.05, "demonstrations": 4.0}
+# Where a curve's unharmed point lies on its axis; without an entry the curve has none.
+UNHARMED = {"start_noise": 0.05, "object": 0.01, "dead": 0.0, "noise": 0.0, "lost": 0.0,
+            "offset": 0.0, "stuck": 0.0}  # fmt: skip
+DEFAULT, NEIGHBOURS = "default", "nearest neighbours, tuned"
+NETWORKS = ("ACT", "Diffusion")
+SHARED, UNROTATED = "one shared memory", "one shared memory without RoPE3D"
+BEHAVIOURS = 4  # of a shared memory, between which a guess has to choose
 
 
 def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
@@ -39,22 +49,46 @@ def pool(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
     Args:
         entries: Finished cells.
     """
-    pooled: dict[tuple[str, str, float, str], dict[str, Any]] = {}
+    pooled: dict[tuple[str, str, float, str], list[dict[str, Any]]] = {}
     for entry in entries:
         for experiment, figures in entry["results"].items():
             key = (entry["contestant"], entry["condition"], entry["level"], experiment)
-            names = ("contestant", "condition", "level", "experiment")
-            point = pooled.setdefault(
-                key,
-                dict(zip(names, key)) | {"seeds": [], "successes": 0, "rollouts": 0, "drift": 0.0},
-            )
-            point["seeds"].append(entry["seed"])
-            point["successes"] += figures["successes"]
-            point["rollouts"] += figures["rollouts"]
-            point["drift"] = max(point["drift"], drift(figures))
-    for point in pooled.values():
-        point["interval"] = wilson(point["successes"], point["rollouts"])
-    return list(pooled.values())
+            pooled.setdefault(key, []).append({"seed": entry["seed"], **figures})
+    names = ("contestant", "condition", "level", "experiment")
+    return [{**dict(zip(names, key)), **_pooled(found)} for key, found in pooled.items()]
+
+
+def _pooled(found: list[dict[str, Any]]) -> dict[str, Any]:
+    successes = sum(figures["successes"] for figures in found)
+    rollouts = sum(figures["rollouts"] for figures in found)
+    point = {
+        "seeds": [figures["seed"] for figures in found],
+        "successes": successes,
+        "rollouts": rollouts,
+        "interval": wilson(successes, rollouts),
+        "train_seconds": statistics.mean(figures["train_seconds"] for figures in found),
+        "memory_bytes": statistics.mean(figures["memory_bytes"] for figures in found),
+        "step_ms": statistics.median(figures["step_ms"] for figures in found),
+    }
+    if "angle_median" in found[0]:
+        weights = [figures["rollouts"] for figures in found]
+        for name in ("within", "angle_median"):
+            total = sum(figures[name] * n for figures, n in zip(found, weights))
+            point[name] = total / sum(weights)
+        return point
+    point["drift"] = max(drift(figures) for figures in found)
+    if "step_times" in found[0]:
+        for name in ("median", "recall_median", "recall_p99"):
+            times = [figures["step_times"][name] for figures in found]
+            point[f"step_{name}_ms"] = statistics.median(times)
+        point["associations"] = statistics.mean(
+            sum(part["learned"] + part["unrelated"] for part in figures["stored"].values())
+            for figures in found
+        )
+        for name in ("smallest", "smallest_unrelated"):
+            leads = [m[name] for figures in found for m in figures["margins"].values()]
+            point[f"margin_{name}"] = min(leads)
+    return point
 
 
 def drift(figures: dict[str, Any]) -> float:
@@ -69,7 +103,7 @@ def drift(figures: dict[str, Any]) -> float:
 
 
 def curve_table(points: list[dict[str, Any]]) -> str:
-    """One line a condition and level: successes and drift of every contestant and experiment.
+    """One line a condition and level: successes of every contestant and experiment.
 
     Args:
         points: From ``pool``.
@@ -77,24 +111,21 @@ def curve_table(points: list[dict[str, Any]]) -> str:
     columns = list(dict.fromkeys((p["contestant"], p["experiment"]) for p in points))
     found = {(p["condition"], p["level"], p["contestant"], p["experiment"]): p for p in points}
     header = ["condition", *(f"{name}: {experiment}" for name, experiment in columns)]
-    lines = ["  ".join([header[0].ljust(18), *(cell.rjust(36) for cell in header[1:])])]
+    lines = ["  ".join([header[0].ljust(18), *(cell.rjust(26) for cell in header[1:])])]
     for condition, level in dict.fromkeys((p["condition"], p["level"]) for p in points):
         cells = []
         for column in columns:
             point = found.get((condition, level, *column))
             cells.append(_shown(point) if point else "")
         lines.append(
-            "  ".join([f"{condition} {level:g}".ljust(18), *(cell.rjust(36) for cell in cells)])
+            "  ".join([f"{condition} {level:g}".ljust(18), *(cell.rjust(26) for cell in cells)])
         )
     return "\n".join(lines)
 
 
 def _shown(point: dict[str, Any]) -> str:
     low, high = point["interval"]
-    return (
-        f"{point['successes']}/{point['rollouts']} ({100 * low:.0f}-{100 * high:.0f} %), "
-        f"drift {point['drift']:.3f}"
-    )
+    return f"{point['successes']}/{point['rollouts']} ({100 * low:.0f}-{100 * high:.0f} %)"
 
 
 def table(entries: list[dict[str, Any]]) -> str:
@@ -142,87 +173,135 @@ def _row(entry: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
-def draw_contestants(entries: list[dict[str, Any]], path: Path) -> Path:
-    """Success rates of all contestants in both experiments.
+Goal = dict[str, Any]
+
+
+def goals(ranked: list[dict[str, Any]], curves: list[dict[str, Any]]) -> list[Goal]:
+    """What the default model should reach, and whether it does.
+
+    A goal says what was measured in words; those whose cells are not finished are left out.
 
     Args:
-        entries: Finished cells of the table.
-        path: Where the picture goes.
+        ranked: Finished cells of the table.
+        curves: From ``pool``.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 1.2 + 0.28 * len(entries)), layout="constrained")
-    both = figure.subplots(1, 2, sharey=True)
-    names = [entry["contestant"] for entry in entries]
-    for axes, experiment in zip(both, EXPERIMENTS):
-        found = [entry["results"][experiment] for entry in entries]
-        rates = [result["successes"] / result["rollouts"] for result in found]
-        spans = [wilson(result["successes"], result["rollouts"]) for result in found]
-        axes.barh(names, rates, color="tab:blue", alpha=0.6)
-        axes.errorbar(rates, names, xerr=_arms(rates, spans), fmt="none", ecolor="k", capsize=2)
-        axes.set(xlim=(0, 1.02), xlabel="success rate, with Wilson's 95 % interval")
-        axes.set_title(f"{experiment}, {found[0]['rollouts']} rollouts each" if found else "")
-        axes.grid(axis="x", alpha=0.3)
-    if entries:
-        both[0].invert_yaxis()
-    figure.savefig(path, dpi=110)
-    return path
+    table = {entry["contestant"]: entry["results"] for entry in ranked}
+    return [*_shared_goals(table), *_network_goals(table, curves), *_curve_goals(curves)]
 
 
-def draw_curves(points: list[dict[str, Any]], path: Path) -> Path:
-    """Success rate against every fault, noisy starts and few demonstrations.
+def _shared_goals(table: dict[str, Any]) -> list[Goal]:
+    found = []
+    if SHARED in table:
+        rate = _rate(table[SHARED]["compliance"])
+        found.append(_goal("shared memory with RoPE3D: right behaviour", "100 %", rate, rate == 1))
+    if UNROTATED in table:
+        rate, chance = _rate(table[UNROTATED]["compliance"]), 1 / BEHAVIOURS
+        found.append(
+            _goal("the same without RoPE3D", f"≤ {chance:.0%} (chance)", rate, rate <= chance)
+        )
+    return found
 
-    Args:
-        points: From ``pool``.
-        path: Where the picture goes.
-    """
-    from matplotlib.figure import Figure
 
-    conditions = [c for c in CONDITIONS if any(p["condition"] == c for p in points)]
-    figure = Figure(figsize=(2 + 2.4 * len(conditions), 6), layout="constrained")
-    grid = figure.subplots(2, max(1, len(conditions)), squeeze=False, sharey=True)
-    names = list(dict.fromkeys(point["contestant"] for point in points))
-    for row, experiment in zip(grid, EXPERIMENTS):
-        for axes, condition in zip(row, conditions):
-            if (condition, experiment) not in {(p["condition"], p["experiment"]) for p in points}:
-                axes.set_axis_off()
-                continue
-            for shift, name in enumerate(names):
-                mine = [
-                    (
-                        UNHARMED.get(condition, 0.0)
-                        if p["condition"] == "unharmed"
-                        else p["level"],
-                        p,
+def _network_goals(table: dict[str, Any], curves: list[dict[str, Any]]) -> list[Goal]:
+    found = []
+    for name in NETWORKS:
+        for experiment in EXPERIMENTS:
+            ours, theirs = (
+                _point(curves, who, "demonstrations", 1.0, experiment) for who in (DEFAULT, name)
+            )
+            if ours and theirs:
+                told = f"{_rate(ours):.0%} : {_rate(theirs):.0%}"
+                better = _rate(ours) > _rate(theirs)
+                found.append(
+                    _goal(
+                        f"1 episode a behaviour, {experiment}: default : {name}", ">", told, better
                     )
-                    for p in points
-                    if p["contestant"] == name
-                    and p["experiment"] == experiment
-                    and p["condition"] in (condition, "unharmed")
-                ]
-                mine.sort(key=lambda pair: pair[0])
-                rates = [p["successes"] / p["rollouts"] for _, p in mine]
-                reach = max((level for level, _ in mine), default=1.0)
-                axes.errorbar(
-                    [level + 0.015 * reach * shift for level, _ in mine],
-                    rates,
-                    yerr=_arms(rates, [p["interval"] for _, p in mine]),
-                    marker="o",
-                    capsize=3,
-                    label=name,
                 )
-            axes.set(xlabel=CONDITIONS[condition], ylim=(-0.03, 1.03))
-            axes.grid(alpha=0.3)
-            if condition == "demonstrations":
-                axes.set_xticks([1, 2, UNHARMED[condition]], ["1", "2", "all"])
-        row[0].set_ylabel(f"{experiment}: success rate")
-    grid[0][0].legend(fontsize=8)
-    figure.savefig(path, dpi=110)
-    return path
+            if not {DEFAULT, name} <= table.keys():
+                continue
+            ours, theirs = (table[who][experiment] for who in (DEFAULT, name))
+            told = f"{_rate(ours):.0%} : {_rate(theirs):.0%}"
+            least = _rate(ours) >= _rate(theirs)
+            found.append(_goal(f"all episodes, {experiment}: default : {name}", "≥", told, least))
+            ratio = theirs["train_seconds"] / ours["train_seconds"]
+            found.append(
+                _goal(f"all episodes, {experiment}: training time of {name} / default", "≥ 100",
+                      f"{ratio:.0f}", ratio >= 100)
+            )  # fmt: skip
+    return found
 
 
-def _arms(rates: list[float], spans: list[tuple[float, float]]) -> list[list[float]]:
-    return [
-        [max(0.0, rate - span[0]) for rate, span in zip(rates, spans)],
-        [max(0.0, span[1] - rate) for rate, span in zip(rates, spans)],
-    ]
+def _curve_goals(curves: list[dict[str, Any]]) -> list[Goal]:
+    found = []
+    for condition in ("force", "posture", "dead", "noise", "lost", "offset", "stuck"):
+        for experiment in EXPERIMENTS:
+            mine, theirs = (
+                [p for p in curves if (p["contestant"], p["condition"], p["experiment"])
+                 == (who, condition, experiment)]
+                for who in (DEFAULT, NEIGHBOURS)
+            )  # fmt: skip
+            if not mine or len(mine) != len(theirs):
+                continue
+            pairs = [(_rate(a), _rate(b)) for a, b in zip(mine, theirs)]
+            told = ", ".join(f"{a:.0%} : {b:.0%}" for a, b in pairs)
+            least = all(a >= b for a, b in pairs)
+            what = f"{CONDITIONS[condition]} ({experiment}): default : neighbours"
+            found.append(_goal(what, "≥ everywhere", told, least))
+    between = _point(curves, DEFAULT, "between", 0.0, "compliance")
+    if between:
+        within = between["within"]
+        found.append(_goal("two patches at once: within 20° of the sum", "≥ 95 %", within,
+                           within >= 0.95))  # fmt: skip
+    for condition, level in (("dead", 0.3), ("lost", 0.3), ("noise", 0.5)):
+        points = [
+            [_point(curves, DEFAULT, name, at, experiment) for experiment in EXPERIMENTS]
+            for name, at in (("unharmed", 0.0), (condition, level))
+        ]
+        if all(point for row in points for point in row):
+            before, after = (_together(row) for row in points)
+            what = f"{CONDITIONS[condition]}: {level:g}, loss of success"
+            found.append(_goal(what, "≤ 5 points", f"{100 * (before - after):.1f} points",
+                               before - after <= 0.05))  # fmt: skip
+    few, crowd = (_point(curves, DEFAULT, "crowding", n, "grasp") for n in (0.0, 1000.0))
+    if few and crowd:
+        loss = _rate(few) - _rate(crowd)
+        found.append(_goal("1,000 unrelated motions: loss of success", "≤ 2 points",
+                           f"{100 * loss:.1f} points", loss <= 0.02))  # fmt: skip
+        for name in ("step_median_ms", "step_recall_median_ms"):
+            what = "a step with a recall" if "recall" in name else "a step under touch"
+            found.append(_goal(f"1,000 unrelated motions: {what}, median", "≤ 1 ms",
+                               f"{crowd[name]:.2f} ms", crowd[name] <= 1.0))  # fmt: skip
+    return found
+
+
+def goal_table(reached: list[Goal]) -> str:
+    """One Markdown line a goal."""
+    lines = ["| what | should be | is | reached |", "|---|---|---|---|"]
+    for goal in reached:
+        yes = "yes" if goal["reached"] else "**no**"
+        lines.append(f"| {goal['what']} | {goal['should']} | {goal['is']} | {yes} |")
+    return "\n".join(lines)
+
+
+def _goal(what: str, should: str, measured: float | str, reached: bool) -> Goal:
+    told = measured if isinstance(measured, str) else f"{measured:.1%}"
+    return {"what": what, "should": should, "is": told, "reached": bool(reached)}
+
+
+def _rate(figures: dict[str, Any]) -> float:
+    return float(figures["successes"] / figures["rollouts"])
+
+
+def _together(points: list[dict[str, Any]]) -> float:
+    """Success rate over the rollouts of both experiments."""
+    won, made = (sum(point[name] for point in points) for name in ("successes", "rollouts"))
+    return float(won / made)
+
+
+def _point(
+    curves: list[dict[str, Any]], who: str, condition: str, level: float, experiment: str
+) -> dict[str, Any]:
+    """A point of a curve; empty where it is not finished."""
+    wanted = (who, condition, level, experiment)
+    names = ("contestant", "condition", "level", "experiment")
+    return next((p for p in curves if tuple(p[name] for name in names) == wanted), {})

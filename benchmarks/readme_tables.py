@@ -2,6 +2,7 @@
 
 uv run eval.py --render=false --output_dir=outputs/eval/default
 uv run eval.py --render=false --method=literal --output_dir=outputs/eval/literal
+uv run benchmarks/policies.py
 uv run python -m benchmarks.readme_tables
 """
 
@@ -13,6 +14,8 @@ from typing import Any
 
 import draccus
 
+from benchmarks.machine import RESULTS
+from benchmarks.policies_report import goal_table
 from hasm_torch.evaluation.report import COMPLIANCE_FIGURES, GRASP_FIGURES, table
 
 
@@ -23,12 +26,59 @@ class Options:
     Attributes:
         default: Evaluation of the default method.
         literal: Evaluation of the paper as written.
+        policies: What ``benchmarks/policies.py`` wrote.
         readme: File whose tables are replaced.
     """
 
     default: Path = Path("outputs/eval/default")
     literal: Path = Path("outputs/eval/literal")
+    policies: Path = RESULTS / "policies.json"
     readme: Path = Path("README.md")
+
+
+# Contestants of the README's table; the full one is what the benchmark prints.
+SHOWN = (
+    "default",
+    "the paper literally",
+    "without spikes",
+    "every sample stored",
+    "touch in the base frame",
+    "real-valued codes",
+    "binary, 4 bits",
+    "gray, 8 bits",
+    "one shared memory",
+    "one shared memory without RoPE3D",
+    "standing still",
+    "nearest neighbours",
+    "nearest neighbours, tuned",
+    "dense associative memory",
+    "ACT",
+    "Diffusion",
+)
+
+
+def contestants(entries: list[dict[str, Any]]) -> str:
+    """A Markdown table of contestants; costs are those of both experiments together."""
+    lines = [
+        "| contestant | compliance | grasp | force order | training | kept | control step |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    found = {entry["contestant"]: entry["results"] for entry in entries}
+    for name in SHOWN:
+        if name not in found:
+            continue
+        both = yielding, grasping = found[name]["compliance"], found[name]["grasp"]
+        order = min(b["spearman"] for b in yielding["behaviours"].values())
+        cells = [
+            name,
+            *(f"{result['successes']}/{result['rollouts']}" for result in both),
+            f"{order:.2f}",
+            f"{sum(result['train_seconds'] for result in both):.3g} s",
+            f"{sum(result['memory_bytes'] for result in both) / 1e3:,.0f} kB",
+            f"{max(yielding['step_ms'], grasping['step_ms']):.2f} ms",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def comparison(default: dict[str, Any], literal: dict[str, Any]) -> str:
@@ -68,9 +118,16 @@ def main() -> None:
         json.loads((folder / "metrics.json").read_text())
         for folder in (options.default, options.literal)
     )
+    policies = json.loads(options.policies.read_text())
     text = options.readme.read_text()
     printed = "```\n" + re.sub(r" +$", "", table(default), flags=re.M) + "\n```"
-    for name, content in (("default", printed), ("literal", comparison(default, literal))):
+    tables = {
+        "default": printed,
+        "literal": comparison(default, literal),
+        "contestants": contestants(policies["contestants"]),
+        "goals": goal_table(policies["goals"]),
+    }
+    for name, content in tables.items():
         before, _, rest = text.partition(f"<!-- table:{name} -->\n")
         _, end, after = rest.partition(f"<!-- /table:{name} -->")
         text = f"{before}<!-- table:{name} -->\n{content}\n{end}{after}"

@@ -26,9 +26,11 @@ from benchmarks.baselines.policies import (
     dense_memory_candidates,
     neighbour_candidates,
 )
-from benchmarks.policies_report import wilson
+from benchmarks.policies_bench import Cell, plan, some_episodes, start_of
+from benchmarks.policies_report import CONDITIONS, goals, pool, wilson
 from hasm_torch.config import Body
 from hasm_torch.evaluation.rollout import Policy
+from hasm_torch.evaluation.runner import EXPERIMENTS
 from hasm_torch.lerobot.episodes import Episode
 
 
@@ -232,7 +234,9 @@ def test_the_default_is_the_default():
 
 def test_a_run_is_resumed_and_reported(tmp_path, capsys):
     log = tmp_path / "policies.jsonl"
-    options = policies.Options(["default"], curves=False, quick=True, output_dir=tmp_path)
+    options = policies.Options(
+        ["default"], curves=False, quick=True, workers=1, output_dir=tmp_path
+    )
     assert all(path.stat().st_size > 0 for path in policies.run(options))
     (line,) = log.read_text().splitlines()
     log.write_text(line + "\n" + line[:40])  # as a run leaves it that is cut off in the next cell
@@ -244,8 +248,93 @@ def test_a_run_is_resumed_and_reported(tmp_path, capsys):
     content = json.loads((tmp_path / "policies.json").read_text())
     ours, still = (entry["results"] for entry in content["contestants"])
     assert ours["compliance"]["successes"] == ours["compliance"]["rollouts"] == 8
-    assert ours["grasp"]["successes"] == ours["grasp"]["rollouts"] == 2
+    assert ours["grasp"]["successes"] == ours["grasp"]["rollouts"] == 1
     assert still["compliance"]["successes"] == still["grasp"]["successes"] == 0
     assert {"cpu", "threads"} <= content["machine"].keys()
     assert content["seed"] == 0
     assert "standing still" in capsys.readouterr().out
+
+
+def test_every_cell_is_planned_once_and_fairly():
+    """The neighbours meet what the default meets, seed by seed, and networks few episodes too."""
+    planned = policies.cells(policies.Options(workers=1))
+    keys = [cell.key for cell in planned]
+    assert len(keys) == len(set(keys))
+    assert {cell.condition for cell in planned} == {"none", "unharmed", *CONDITIONS}
+    for rival in (policies.TUNED_NEIGHBOURS, "ACT", "Diffusion"):
+        theirs = {(*vars(c).values(),)[1:] for c in planned if c.contestant == rival}
+        ours = {(*vars(c).values(),)[1:] for c in planned if c.contestant == "default"}
+        assert theirs <= ours
+    for condition in {cell.condition for cell in planned} - {"none"}:
+        seeds = {cell.seed for cell in planned if cell.condition == condition}
+        assert len(seeds) == 3
+
+
+def test_conditions_change_what_they_say():
+    def cell(condition: str, level: float) -> Cell:
+        return Cell("default", condition, level, 0, 4, 4)
+
+    assert {c.force for c in plan(cell("force", 8.0), "compliance") if not c.changing} == {8.0}
+    assert {c.force for c in plan(cell("force", 8.0), "grasp")} == {8.0}
+    assert {c.start_noise for c in plan(cell("start_noise", 0.3), "grasp")} == {0.3}
+    assert {c.object_noise for c in plan(cell("object", 0.04), "grasp")} == {0.04}
+    assert plan(cell("dead", 0.3), "grasp") == plan(cell("unharmed", 0.0), "grasp")
+
+
+def test_a_posture_moves_from_the_shown_one_to_any():
+    @dataclass
+    class Limits:
+        joint_lower: np.ndarray
+        joint_upper: np.ndarray
+
+        @property
+        def unwrapped(self):
+            return self
+
+    env = Limits(np.full(8, -1.0), np.full(8, 2.0))
+    for case in plan(Cell("default", "posture", 0.0, 0, 3, 0), "compliance"):
+        shown, half, drawn = (
+            start_of(Cell("default", "posture", level, 0, 3, 0), case, env)
+            for level in (0.0, 0.5, 1.0)
+        )
+        np.testing.assert_allclose(half, (shown + drawn) / 2)
+        assert (shown == drawn).sum() == 1, "the yielding joint starts where it would anyway"
+    assert start_of(Cell("default", "none", 0.0, 0, 3, 0), case, env) is None
+
+
+def test_few_episodes_are_drawn_from_every_behaviour():
+    episodes = touched_episodes(make_body())
+    picked = some_episodes(episodes, 1, seed=3)
+    assert sorted(episodes[i].task for i in picked) == ["front", "side"]
+    assert {some_episodes(episodes, 1, seed) for seed in range(8)} != {picked}
+    assert some_episodes(episodes, 9, seed=3) == (0, 1, 2, 3)
+
+
+def entry(contestant, condition, level, seed, experiment, successes, rollouts, **more):
+    drifts = {"hold_drift_rad": 0.0} if experiment == "grasp" else {"behaviours": {}}
+    figures = {"successes": successes, "rollouts": rollouts, "train_seconds": 1.0,
+               "memory_bytes": 10, "step_ms": 0.2, **drifts, **more}  # fmt: skip
+    if experiment == "compliance":
+        figures["behaviours"] = {"arm_up": {"release_drift_rad": 0.01 * seed}}
+    return {"contestant": contestant, "condition": condition, "level": level, "seed": seed,
+            "results": {experiment: figures}}  # fmt: skip
+
+
+def test_seeds_are_pooled_and_goals_judged():
+    curves = pool(
+        [entry("default", "unharmed", 0.0, s, e, 10, 10) for s in range(3) for e in EXPERIMENTS]
+        + [entry("default", "dead", 0.3, s, e, 9, 10) for s in range(3) for e in EXPERIMENTS]
+        + [entry("nearest neighbours, tuned", "dead", 0.3, s, "grasp", 10, 10) for s in range(3)]
+    )
+    found = {(p["contestant"], p["condition"], p["experiment"]): p for p in curves}
+    point = found["default", "dead", "compliance"]
+    assert (point["successes"], point["rollouts"], point["seeds"]) == (27, 30, [0, 1, 2])
+    assert point["interval"] == pytest.approx(wilson(27, 30))
+    assert point["drift"] == pytest.approx(0.02)
+    reached = {goal["what"]: goal for goal in goals([], curves)}
+    loss = reached["dead cells, share: 0.3, loss of success"]
+    assert loss["is"] == "10.0 points"
+    assert not loss["reached"]
+    (beside,) = (goal for what, goal in reached.items() if "neighbours" in what)
+    assert beside["is"] == "90% : 100%"
+    assert not beside["reached"]

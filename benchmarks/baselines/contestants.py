@@ -1,12 +1,16 @@
 """Everyone who is rolled out, by name, and what it takes to train them."""
 
+import importlib
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Protocol
 
 from benchmarks.baselines.demonstrations import Candidate
+from benchmarks.baselines.learned import act, diffusion
+from benchmarks.baselines.learned_training import Training
 from benchmarks.baselines.policies import (
     SamplePolicy,
     StandStill,
@@ -49,7 +53,13 @@ Outcome = tuple[Contestant, dict[str, Any]]
 Train = Callable[[str, Body, Sequence[Episode]], Outcome]
 
 
-def train(name: str, experiment: str, body: Body, episodes: Sequence[Episode]) -> Trained:
+def train(
+    name: str,
+    experiment: str,
+    body: Body,
+    episodes: Sequence[Episode],
+    training: Training | None = None,
+) -> Trained:
     """Train a contestant.
 
     Args:
@@ -57,11 +67,17 @@ def train(name: str, experiment: str, body: Body, episodes: Sequence[Episode]) -
         experiment: "compliance" or "grasp".
         body: The robot.
         episodes: What is learned.
+        training: How a network is trained, by default until its held-out loss stops falling.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
+        make = CONTESTANTS[name]
+        if name in LEARNED:
+            make = partial(LEARNED[name], training=training or Training())
+            for module in LIBRARIES:  # loading them is no training
+                importlib.import_module(module)
         begin = time.perf_counter()
-        policy, notes = CONTESTANTS[name](experiment, body, episodes)
+        policy, notes = make(experiment, body, episodes)
         seconds = time.perf_counter() - begin
     told = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
     return Trained(policy, seconds, notes | ({"warnings": told} if told else {}))
@@ -82,6 +98,10 @@ def settings() -> dict[str, HASMConfig]:
     for bits in BINARY_BITS:
         mine[f"binary, {bits} bits"] = replace(default, code="binary", bits=bits)
     mine["real-valued codes"] = replace(default, rebinarise=False, storage="float32")
+    mine["one shared memory"] = replace(default, memories="shared")
+    mine["one shared memory, real-valued"] = replace(mine["real-valued codes"], memories="shared")
+    mine["one shared memory, base frame"] = replace(default, memories="shared", frame="base")
+    mine["one shared memory without RoPE3D"] = replace(default, memories="shared", rope=False)
     mine["touch in the base frame"] = replace(default, frame="base")
     mine["every sample stored"] = replace(default, store="sample")
     for beta in BETAS:
@@ -116,10 +136,17 @@ def _stand_still(experiment: str, body: Body, episodes: Sequence[Episode]) -> Ou
 NEIGHBOURS = "nearest neighbours"
 TUNED_NEIGHBOURS = "nearest neighbours, tuned"
 
+LIBRARIES = (
+    "lerobot.policies.act.modeling_act",
+    "lerobot.policies.diffusion.modeling_diffusion",
+    "diffusers",
+)
+LEARNED: dict[str, Callable[..., Outcome]] = {"ACT": act, "Diffusion": diffusion}
 CONTESTANTS: dict[str, Train] = {
     **{name: _hasm(config) for name, config in settings().items()},
     "standing still": _stand_still,
     NEIGHBOURS: _from_samples(lambda _: neighbour_candidates()),
     TUNED_NEIGHBOURS: _from_samples(tuned_neighbour_candidates),
     "dense associative memory": _from_samples(lambda _: dense_memory_candidates()),
+    **LEARNED,
 }

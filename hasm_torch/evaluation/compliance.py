@@ -43,6 +43,8 @@ ROOM = 0.3  # share of the yielding joint's range that is left ahead of it at th
 END_MARGIN = 0.02  # share of the range: nearer to its end a joint has nowhere to go
 SPEED_WINDOW = 0.1  # s over which the speed within a rollout is taken
 LARGEST_LAG = 0.2  # s between force and speed
+MOVED = 0.02  # rad, what the yielding joint of a successful rollout must travel at least
+STAYED = 0.005  # rad or m, what every other joint of it may give way
 
 
 class Push:
@@ -203,6 +205,15 @@ def measure(
             trace.force[first : last + 1], position[first : last + 1], period
         )
     return figures
+
+
+def succeeded(figures: dict[str, Any]) -> bool:
+    """Whether the right joint went the right way and the others stayed.
+
+    Args:
+        figures: What ``run_case`` measured.
+    """
+    return bool(figures["displacement"] > MOVED and figures["others"] < STAYED)
 
 
 def tracking(force: Array, position: Array, period: float) -> float:

@@ -29,8 +29,6 @@ Observation = dict[str, NDArray[np.float32]]
 COMPLIANCE_FORCES, GRASP_FORCES = (2.0, 14.0), (3.0, 12.0)  # N, from which a touch is drawn
 PAUSES = 3  # of the human in a grasp
 START_NOISE = 0.05  # rad, of a grasp's start
-MOVED = 0.02  # rad, what the yielding joint must travel at least
-STAYED = 0.005  # rad or m, what every other joint may give way
 PICTURE_EVERY = 5  # steps, because a picture takes longer than many steps
 
 
@@ -152,4 +150,4 @@ class HumanTouchEnv(gym.Env[Observation, NDArray[np.float32]]):
         joint = JOINTS.index(behaviour.joint)
         moved = behaviour.direction * (self.sim.joint_position - self._start)[joint]
         others = np.delete(self._highest - self._lowest, joint)
-        return bool(moved > MOVED and others.max() < STAYED)
+        return compliance.succeeded({"displacement": moved, "others": others.max()})
