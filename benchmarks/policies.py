@@ -72,7 +72,8 @@ class Options:
             A point of a curve takes half of both from each seed.
         seeds: Seeds of the curves.
         seed: First seed.
-        train_seconds: Longest training of a network, s of one core.
+        train_seconds: Longest training of a network for the table, s of one core; half as long
+            for a point of a curve.
         quick: One rollout, one seed, few conditions, networks hardly trained; in another folder.
         minutes: Start nothing new after so long; the next run goes on.
         workers: Processes, each with one thread.
@@ -85,7 +86,7 @@ class Options:
     rollouts: int = 4
     seeds: int = 3
     seed: int = 0
-    train_seconds: float = 100.0
+    train_seconds: float = 120.0
     quick: bool = False
     minutes: float | None = None
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)

@@ -4,7 +4,7 @@ import json
 import statistics
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -20,11 +20,13 @@ from benchmarks.baselines.faults import Fault, FaultySkin, Kind
 from benchmarks.baselines.learned_training import Training
 from hasm_torch.config import Body
 from hasm_torch.evaluation import combined, compliance, grasp
+from hasm_torch.evaluation.evaluate import TIMED_FORCE
 from hasm_torch.evaluation.rollout import Array, Policy
 from hasm_torch.evaluation.runner import EXPERIMENTS, make_env, run_case
 from hasm_torch.hasm import HASM
 from hasm_torch.lerobot.body import body_of
 from hasm_torch.lerobot.episodes import Episode, load_episodes
+from hasm_torch.readings import pressed
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.demonstrator import POSTURE, compliance_episodes, grasp_episodes
 from hasm_torch.sim.poses import START_POSES
@@ -71,7 +73,7 @@ class Bench:
 
     Args:
         datasets: Folder of the bundled datasets.
-        training: How networks are trained.
+        training: How networks are trained for the table; for the curves half as long.
     """
 
     def __init__(self, datasets: Path, training: Training) -> None:
@@ -158,7 +160,10 @@ class Bench:
     ) -> Trained:
         episodes = self.pool(experiment) if from_pool else self.episodes[experiment]
         chosen = [episodes[i] for i in picked]
-        return train(contestant, experiment, self.body[experiment], chosen, self.training)
+        training = self.training
+        if from_pool:
+            training = replace(training, seconds=training.seconds / 2)
+        return train(contestant, experiment, self.body[experiment], chosen, training)
 
     def _crowd(self, model: Any, experiment: str, cell: Cell) -> tuple[HASM, dict[str, Any]]:
         """The model with unrelated motions in each of its memories, and what they do to it."""
@@ -230,8 +235,7 @@ def step_ms(policy: Policy, body: Body) -> float:
     The mean, since some policies plan seldom and long.
     """
     state = (torch.tensor(body.lower) + torch.tensor(body.upper)) / 2
-    skin = torch.zeros(sum(body.cells), 3)
-    skin[3] = 8.0 / 3
+    skin = pressed(body, body.patches[0], TIMED_FORCE)
     policy.reset()
     spent = []
     for _ in range(TIMED_STEPS):

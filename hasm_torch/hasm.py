@@ -112,7 +112,7 @@ class HASM(nn.Module):
 
     def memory(self, patch: str) -> PatchMemory:
         """The memory of a patch that has learned something."""
-        memory = self.memories[SHARED if SHARED in self.memories else patch]
+        memory = self.memories[SHARED if self.config.memories == "shared" else patch]
         assert isinstance(memory, PatchMemory)
         return memory
 

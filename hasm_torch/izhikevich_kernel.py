@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 LANES = 32  # neurons stepped side by side, as SIMD lanes
@@ -84,26 +85,34 @@ def _compiled_kernel() -> Callable[..., None]:
         return compiled()(kernel)
 
 
-def _run_kernel(
-    current: Tensor, v: Tensor, u: Tensor,
+def run(
+    current: NDArray[Any], v: NDArray[Any], u: NDArray[Any],
     a: float, b: float, c: float, d: float, v_th: float, dt_ms: float,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """The compiled kernel over (..., T) currents and (...) states of one real dtype on the CPU."""
+) -> NDArray[Any]:  # fmt: skip
+    """Spikes of neurons side by side; arrays of one real dtype, C-contiguous.
+
+    Args:
+        current: (N, T) synaptic current, one sample a step.
+        v: (N,) membrane potential, moved on in place.
+        u: (N,) recovery variable, moved on in place.
+        a: As for ``izhikevich``, like the parameters that follow.
+        b: See there.
+        c: See there.
+        d: See there.
+        v_th: See there.
+        dt_ms: See there.
+
+    Returns:
+        (N, T), 0 or 1.
+    """
     kernel = _compiled_kernel()
-    spikes = current.new_empty(current.shape)
-    v = v.clone(memory_format=torch.contiguous_format)
-    u = u.clone(memory_format=torch.contiguous_format)
-    steps, neurons = current.shape[-1], v.numel()
-    arrays = (
-        current.detach().contiguous().numpy().reshape(neurons, steps),
-        v.detach().numpy().reshape(neurons),
-        u.detach().numpy().reshape(neurons),
-        spikes.numpy().reshape(neurons, steps),
-    )
+    spikes = np.empty_like(current)
+    arrays = (current, v, u, spikes)
+    neurons, steps = current.shape
     threads = min(torch.get_num_threads(), -(-neurons // LANES))
     if threads == 1 or neurons * steps < PARALLEL_WORK:
         kernel(*arrays, a, b, c, d, v_th, dt_ms)
-        return spikes, v, u
+        return spikes
     # Threads of this call alone: a pool kept for the next one would not survive a fork, and data
     # loaders fork.
     share = -(-neurons // (threads * LANES)) * LANES
@@ -116,7 +125,24 @@ def _run_kernel(
         ]
         for job in jobs:
             job.result()
-    return spikes, v, u
+    return spikes
+
+
+def _run_kernel(
+    current: Tensor, v: Tensor, u: Tensor,
+    a: float, b: float, c: float, d: float, v_th: float, dt_ms: float,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    """``run`` over (..., T) currents and (...) states on the CPU."""
+    v = v.clone(memory_format=torch.contiguous_format)
+    u = u.clone(memory_format=torch.contiguous_format)
+    neurons = v.numel()
+    spikes = run(
+        current.detach().contiguous().numpy().reshape(neurons, current.shape[-1]),
+        v.detach().numpy().reshape(neurons),
+        u.detach().numpy().reshape(neurons),
+        a, b, c, d, v_th, dt_ms,
+    )  # fmt: skip
+    return torch.from_numpy(spikes).view(current.shape), v, u
 
 
 def _describe_kernel(

@@ -51,6 +51,24 @@ def as_forces(readings: Tensor) -> Tensor:
     return torch.nn.functional.pad(pushes.flatten(-2).unsqueeze(-1), (0, FORCES - PRESSURE))
 
 
+def pressed(body: Body, patch: str, force: float) -> Tensor:
+    """Forces of a robot's cells while one patch is pressed evenly.
+
+    Args:
+        body: The robot.
+        patch: Name of the patch.
+        force: N.
+
+    Returns:
+        (cells, 3), N.
+    """
+    index = body.patches.index(patch)
+    first, count = sum(body.cells[:index]), body.cells[index]
+    skin = torch.zeros(sum(body.cells), FORCES)
+    skin[first : first + count] = force / (FORCES * count)
+    return skin
+
+
 def forces_of(body: Body, readings: Tensor | None, leading: tuple[int, ...] = ()) -> Tensor:
     """Forces of a robot's cells from its tactile vector.
 

@@ -9,10 +9,12 @@ of External Forces" of the paper.
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hasm_torch.izhikevich import Izhikevich, IzhikevichState
+from hasm_torch.izhikevich import Izhikevich, IzhikevichState, resting_state
+from hasm_torch.skin_kernel import encode_skin
 from hasm_torch.touch import cell_excess
 
 
@@ -44,7 +46,7 @@ class SkinState(NamedTuple):
     """
 
     recent: Tensor
-    neurons: IzhikevichState | None
+    neurons: IzhikevichState
 
 
 class SkinEncoder(nn.Module):
@@ -97,6 +99,7 @@ class SkinEncoder(nn.Module):
         self.threshold, self.window = threshold, window
         self.current_per_newton = current_per_newton
         self.neuron = Izhikevich(dt_ms=spike_dt_ms)
+        self._borders = np.concatenate([[0], np.cumsum(cells)])
         patch_of_cell = torch.repeat_interleave(torch.arange(len(cells)), torch.tensor(cells))
         self.register_buffer("patch_of_cell", patch_of_cell)
 
@@ -118,17 +121,50 @@ class SkinEncoder(nn.Module):
         """
         if skin.ndim < 3 or skin.shape[-2:] != (self.total, 3):
             raise ValueError(f"expected skin (..., T, {self.total}, 3), got {tuple(skin.shape)}")
-        excess = cell_excess(skin, self.threshold)
-        totals = excess.new_zeros(*excess.shape[:-1], self.patches)
-        totals = totals.index_add_(-1, self.patch_of_cell, excess)
-        before = totals.new_zeros(*totals.shape[:-2], self.window - 1, self.patches)
-        stream = torch.cat([before if state is None else state.recent, totals], dim=-2)
-        # Added in order of time, so that rounding does not depend on the length of the chunk.
-        shifts = (stream[..., i : i + skin.shape[-3], :] for i in range(self.window))
-        force = sum(shifts, torch.zeros_like(totals)) / self.window
+        leading = skin.shape[:-3]
+        if state is None:
+            recent = skin.new_zeros(*leading, self.window - 1, self.patches)
+            neurons = resting_state(recent.new_zeros(*leading, self.patches, 1), self.neuron.b)
+            state = SkinState(recent, neurons)
+        tensors = (skin, state.recent, *state.neurons)
+        on_cpu = all(x.device.type == "cpu" and x.dtype == torch.float32 for x in tensors)
+        if on_cpu and not (torch.is_grad_enabled() and any(x.requires_grad for x in tensors)):
+            return self._in_arrays(skin, state)
+        force, recent = self._window_forces(skin, state.recent)
         # One sample of current a step, held over the sample period.
         current = (self.current_per_newton * force).mT.unsqueeze(-1)
         current = current.expand(*current.shape[:-1], self.steps).flatten(-2)
-        spikes, neurons = self.neuron(current, None if state is None else state.neurons)
+        spikes, neurons = self.neuron(current, state.neurons)
         counts = spikes.unflatten(-1, (-1, self.steps)).sum(-1).mT
-        return counts, force, SkinState(stream[..., skin.shape[-3] :, :], neurons)
+        return counts, force, SkinState(recent, neurons)
+
+    def _in_arrays(self, skin: Tensor, state: SkinState) -> tuple[Tensor, Tensor, SkinState]:
+        leading, streams = skin.shape[:-3], math.prod(skin.shape[:-3])
+        v, u = (x.detach().numpy().reshape(streams * self.patches).copy() for x in state.neurons)
+        counts, force, recent = encode_skin(
+            skin.detach().contiguous().numpy().reshape(streams, *skin.shape[-3:]),
+            self._borders,
+            self.threshold,
+            self.current_per_newton,
+            self.steps,
+            self.neuron,
+            state.recent.detach().numpy().reshape(streams, *state.recent.shape[-2:]),
+            v,
+            u,
+        )
+        after = (torch.from_numpy(x.reshape(*leading, self.patches)) for x in (v, u))
+        counted, felt, last = (
+            torch.from_numpy(x.reshape(*leading, *x.shape[1:])) for x in (counts, force, recent)
+        )
+        return counted, felt, SkinState(last, IzhikevichState(*after))
+
+    def _window_forces(self, skin: Tensor, recent: Tensor) -> tuple[Tensor, Tensor]:
+        """Effective force of each patch, averaged over the window, and the last samples' own."""
+        excess = cell_excess(skin, self.threshold)
+        totals = excess.new_zeros(*excess.shape[:-1], self.patches)
+        totals = totals.index_add(-1, self.patch_of_cell, excess)
+        stream = torch.cat([recent, totals], dim=-2)
+        # Added in order of time, so that rounding does not depend on the length of the chunk.
+        shifts = (stream[..., i : i + skin.shape[-3], :] for i in range(self.window))
+        force = sum(shifts, torch.zeros_like(totals)) / self.window
+        return force, stream[..., skin.shape[-3] :, :]

@@ -1,6 +1,6 @@
 """What a noisy, drifted or partly dead skin would have read if it were sound.
 
-    lost samples ──hold──► noise level, common level ──reject──► dead cells ──impute──► forces
+    lost samples ──hold──► noise, offset, stuck cells ──reject──► dead cells ──impute──► forces
 
 A clean reading passes unchanged, to the last bit. r_c is the L1 norm of a cell's three forces.
 
@@ -14,6 +14,10 @@ A clean reading passes unchanged, to the last bit. r_c is the L1 norm of a cell'
   in the middle of its cells is taken from all, but for what noise adds to a reading that cannot
   fall below zero; to a cell that is pressed noise adds nothing.
   Cells are compared only across ``PATCHES_COMPARED`` patches or more: a hand may hold all of fewer.
+* **Stuck cell.** A cell that reads a force from the first sample on while no other cell of its
+  patch reads any, although its touches always spread, may be stuck. It reads zero for
+  ``PROBATION_S``, and on as long as its reading has not changed at all while others did in
+  ``STIRRED`` samples.
 * **Dead cell.** A touch spreads through the elastomer, so that each cell of a patch takes a share
   of its force. Cells that took theirs at every touch of the episodes are silent only if they are
   dead: their share is then put back, from the median over the other cells of reading / share.
@@ -37,6 +41,8 @@ PATCHES_COMPARED = 4
 RECTIFIED = 1.2  # mean over standard deviation of a sum of three rectified normal noises
 SILENT = 1e-3  # N: a cell that should read CLEAR times as much is dead
 CLEAR = 5.0
+PROBATION_S = 0.4
+STIRRED = 5
 TOUCHED = 1.0  # N on a patch of the episodes, from which a cell's share of it is learned
 # Standard deviation over median of |second difference| and over median absolute deviation.
 _SECOND_DIFFERENCE, _DEVIATION = 1 / (0.6745 * 6**0.5), 1 / 0.6745
@@ -52,6 +58,8 @@ class FilterState:
         seen: Samples so far.
         readings: (LONG_WINDOW, cells) last readings, the newest at ``(seen − 1) % LONG_WINDOW``, N.
         changes: (LONG_WINDOW,) last medians of the second differences, N.
+        stuck: (cells,) what a cell has read since the first sample that may be stuck, N; else 0.
+        stirred: Samples in which a cell that may not be stuck read something new.
     """
 
     last: NDArray[np.float32]
@@ -59,6 +67,8 @@ class FilterState:
     seen: int
     readings: NDArray[np.float32]
     changes: NDArray[np.float32]
+    stuck: NDArray[np.float32]
+    stirred: int
 
     @classmethod
     def start(cls, cells: int) -> "FilterState":
@@ -69,6 +79,8 @@ class FilterState:
             0,
             np.zeros((LONG_WINDOW, cells), np.float32),
             np.zeros(LONG_WINDOW, np.float32),
+            np.zeros(cells, np.float32),
+            0,
         )
 
 
@@ -104,9 +116,9 @@ def clean_skin(
     state = FilterState.start(total) if state is None else state
     cleaned = skin.detach().float().cpu().numpy().copy()
     borders = np.concatenate([[0], np.cumsum(cells)])
-    state.missed, state.seen = _compiled()(
-        cleaned, borders, footprint, round(HOLD_S * rate), state.last, state.missed, state.seen,
-        state.readings, state.changes,
+    state.missed, state.seen, state.stirred = _compiled()(
+        cleaned, borders, footprint, round(HOLD_S * rate), round(PROBATION_S * rate), state.last,
+        state.missed, state.seen, state.readings, state.changes, state.stuck, state.stirred,
     )  # fmt: skip
     return torch.from_numpy(cleaned).to(skin.device), state
 
@@ -145,14 +157,14 @@ class Footprint:
 
 
 @functools.cache
-def _compiled() -> Callable[..., tuple[int, int]]:
+def _compiled() -> Callable[..., tuple[int, int, int]]:
     """The pass, compiled on first use and then cached on disk."""
     import numba
 
     def kernel(
-        skin: Any, borders: Any, footprint: Any, hold: int, last: Any, missed: int, seen: int,
-        readings: Any, changes: Any,
-    ) -> tuple[int, int]:  # fmt: skip
+        skin: Any, borders: Any, footprint: Any, hold: int, probation: int, last: Any, missed: int,
+        seen: int, readings: Any, changes: Any, stuck: Any, stirred: int,
+    ) -> tuple[int, int, int]:  # fmt: skip
         samples, cells = skin.shape[:2]
         reading, mean, change = np.empty(cells), np.empty(cells), np.empty(cells)
         for t in range(samples):
@@ -173,6 +185,22 @@ def _compiled() -> Callable[..., tuple[int, int]]:
                 reading[c] = abs(skin[t, c, 0]) + abs(skin[t, c, 1]) + abs(skin[t, c, 2])
                 readings[newest, c] = reading[c]
                 change[c] = abs(reading[c] - 2.0 * readings[before, c] + readings[older, c])
+            if seen == 0:
+                for p in range(len(borders) - 1):
+                    pressed, spreading, at = 0, 0, 0
+                    for c in range(borders[p], borders[p + 1]):
+                        spreading += footprint[c] > 0.0
+                        if reading[c] > SILENT:
+                            pressed, at = pressed + 1, c
+                    if pressed == 1 and spreading > 1 and footprint[at] > 0.0:
+                        stuck[at] = readings[newest, at]
+            news = False
+            for c in range(cells):
+                if readings[newest, c] != stuck[c]:
+                    stuck[c] = 0.0
+                if stuck[c] == 0.0 and seen and readings[newest, c] != readings[before, c]:
+                    news = True
+            stirred += news
             seen += 1
             known = min(seen, LONG_WINDOW)
             compared = len(borders) > PATCHES_COMPARED
@@ -204,6 +232,11 @@ def _compiled() -> Callable[..., tuple[int, int]]:
                         skin[t, c, i] *= scale
                     reading[c] = felt
 
+            for c in range(cells):
+                if stuck[c] > 0.0 and (seen <= probation or stirred >= STIRRED):
+                    skin[t, c, :] = 0.0
+                    reading[c] = 0.0
+
             silent = max(SILENT, doubt)
             for p in range(len(borders) - 1):
                 first, end = borders[p], borders[p + 1]
@@ -221,7 +254,7 @@ def _compiled() -> Callable[..., tuple[int, int]]:
                     if reading[c] <= silent and share > CLEAR * silent:
                         for i in range(3):
                             skin[t, c, i] = share / 3.0
-        return missed, seen
+        return missed, seen, stirred
 
     compiled = functools.partial(numba.njit, nogil=True)
     try:

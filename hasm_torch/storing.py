@@ -44,11 +44,11 @@ class FitReport:
 
     Attributes:
         episodes: Episodes read.
-        associations: Associations held, by patch.
-        joints: Names of the joints that each patch moves.
-        betas: Inverse temperature of each patch's memory.
+        associations: Associations held, by memory: that of a patch, by its name, or the shared one.
+        joints: Names of the joints that the patches of each memory move.
+        betas: Inverse temperature of each memory.
         recall_errors: Largest error of a recalled successor at its own association (of at most
-            4,096 in each memory), as a share of the joint range, by patch. Where it is small,
+            4,096 of each patch), as a share of the joint range, by memory. Where it is small,
             recall visits every stored state.
     """
 

@@ -122,3 +122,23 @@ def test_bad_arguments_are_named():
         encoder()(torch.zeros(7, 3))
     with pytest.raises(ValueError, match=r"expected skin \(..., T, 7, 3\)"):
         encoder()(torch.zeros(5, 7, 1))
+
+
+@given(parts=st.lists(st.integers(0, 6), min_size=1, max_size=3), window=st.integers(1, 4),
+       leading=st.sampled_from([(), (2,), (2, 3)]), seed=st.integers(0, 99))  # fmt: skip
+@settings(max_examples=20, deadline=None)
+def test_the_compiled_pass_equals_the_tensor_operations(parts, window, leading, seed):
+    skin = random_skin(*leading, sum(parts), seed=seed) - 0.3
+    coder, states = encoder(window), [None, None]
+    for chunk in skin.split(parts, dim=-3):
+        *plain, states[0] = coder(chunk, states[0])
+        *tensors, states[1] = coder(chunk.clone().requires_grad_(), states[1])
+        for one, other in zip(plain, tensors):
+            torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(states[0].recent, states[1].recent, rtol=1e-6, atol=1e-6)
+
+
+def test_gradients_of_the_force_are_right():
+    skin = (random_skin(4, seed=2) + 0.1).double().requires_grad_()
+    coder = encoder(2)
+    assert torch.autograd.gradcheck(lambda readings: coder(readings)[1], skin)

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.skin_filter import HOLD_S, Footprint, clean_skin
+from hasm_torch.skin_filter import HOLD_S, PROBATION_S, Footprint, clean_skin
 
 CELLS, RATE = [7, 7, 7, 7, 6, 5], 50.0
 TOTAL = sum(CELLS)
@@ -131,6 +131,35 @@ def test_a_touch_beside_the_usual_place_is_not_taken_for_a_dead_cell():
     skin[10:, [CELLS[0], place + 1, place + 5]] = 0.05 / 3
     felt, real = newtons(clean(skin, FOOTPRINT))[:, 1], newtons(skin)[:, 1]
     assert (felt <= 1.2 * real).all()
+
+
+@pytest.mark.parametrize("stuck", [0, 3, 20])
+def test_a_cell_that_is_stuck_from_the_start_is_no_touch(stuck):
+    skin = touched(push(100, 6.0, 2))
+    broken = skin.clone()
+    broken[:, stuck] = 0.5
+    felt, real = newtons(clean(broken, FOOTPRINT)), newtons(skin)
+    np.testing.assert_allclose(felt, real, rtol=0.01, atol=1e-5)
+
+
+def test_a_constant_touch_from_the_start_is_a_touch():
+    """Pressed evenly at once; on a single cell after the probation, since nothing else stirs."""
+    even = touched(np.full(60, 6.0))
+    assert torch.equal(clean(even, FOOTPRINT), even)
+    lonely = torch.zeros(60, TOTAL, 3)
+    lonely[:, CELLS[0]] = 2.0
+    cleaned = clean(lonely, FOOTPRINT)
+    waiting = round(PROBATION_S * RATE)
+    assert not cleaned[:waiting].any()
+    assert torch.equal(cleaned[waiting:, CELLS[0]], lonely[waiting:, CELLS[0]])
+    assert torch.equal(clean(lonely), lonely)  # nothing is known of how touches spread
+
+
+def test_a_stuck_cell_that_comes_back_is_heard_again():
+    skin = touched(push(100, 6.0, 2))
+    skin[:60, CELLS[0] + CELLS[1]] = 0.5
+    skin[60:, CELLS[0] + CELLS[1]] = 0.7
+    assert clean(skin, FOOTPRINT)[60:, CELLS[0] + CELLS[1]].any()
 
 
 def test_a_footprint_leaves_out_cells_that_a_touch_may_miss():

@@ -13,11 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hasm_torch.config import Body
 from hasm_torch.crowding import LARGEST_WORK
 from hasm_torch.evaluation.grasp import GRASP_PATCH, REACH_PATCH
 from hasm_torch.hasm import HASM
 from hasm_torch.memory import HeteroAssociativeMemory
+from hasm_torch.readings import pressed
 from hasm_torch.recall.packed import ROWS, unpack
 
 # Weight of the right association over all others together, as ``HASM.fit`` asks for.
@@ -157,19 +157,12 @@ def step_times(model: HASM, start: Tensor, rounds: int = 3) -> StepTimes:
     )
 
 
-def pressed(body: Body, patch: str) -> Tensor:
-    """A skin on which the first cell of one patch is pressed, (cells, 3) N."""
-    skin = torch.zeros(sum(body.cells), 3)
-    skin[sum(body.cells[: body.patches.index(patch)])] = FORCE / 3
-    return skin
-
-
 def _walk(model: HASM, start: Tensor, calls: list[Any]) -> Iterator[tuple[float, int]]:
     """Milliseconds and recalls of every step up to where both motions have ended."""
     model.reset()
     state = start
     for patch in (REACH_PATCH, GRASP_PATCH):
-        skin, since, steps = pressed(model.body, patch), 0, 0
+        skin, since, steps = pressed(model.body, patch, FORCE), 0, 0
         while since < STILL_STEPS and steps < MOST_STEPS:
             calls.clear()
             begin = time.perf_counter()

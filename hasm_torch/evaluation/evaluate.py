@@ -17,12 +17,14 @@ from hasm_torch.evaluation import compliance, grasp
 from hasm_torch.evaluation.report import table
 from hasm_torch.evaluation.runner import EXPERIMENTS, check_experiments, run_cases
 from hasm_torch.hasm import HASM
+from hasm_torch.readings import pressed
 from hasm_torch.robot import JOINTS, Skin
 from hasm_torch.sim.env import LARGEST_FORCE
 from hasm_torch.training import DatasetConfig, FeaturesConfig, RobotConfig, settings, train
 
 ROLLOUTS = {"compliance": 40, "grasp": 100}
 TIMED_STEPS = 2000
+TIMED_FORCE = 8.0  # N
 
 
 @dataclass
@@ -195,11 +197,7 @@ def time_steps(model: HASM, steps: int = TIMED_STEPS) -> dict[str, float]:
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    patch = model.patches[0]
-    index = model.body.patches.index(patch)
-    first = sum(model.body.cells[:index])
-    skin = torch.zeros(sum(model.body.cells), 3)
-    skin[first] = 8.0 / 3
+    skin = pressed(model.body, model.patches[0], TIMED_FORCE)
     begin = (model.lower + model.upper) / 2
     model.reset()
     state, spent = begin, []
