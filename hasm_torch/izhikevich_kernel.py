@@ -15,6 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hasm_torch._compile import compile_kernel
+
 LANES = 32  # neurons stepped side by side, as SIMD lanes
 BLOCK = 512  # steps between two transpositions; a block stays in the L2 cache
 PARALLEL_WORK = 1 << 20  # neuron steps above which starting threads costs less than it saves
@@ -23,7 +25,6 @@ PARALLEL_WORK = 1 << 20  # neuron steps above which starting threads costs less 
 @functools.cache
 def _compiled_kernel() -> Callable[..., None]:
     """The kernel, compiled on first use and then cached on disk (numba loads in about 0.5 s)."""
-    import numba
 
     def kernel(
         current: Any, v: Any, u: Any, spikes: Any, a64: Any, b64: Any, c64: Any, d64: Any,
@@ -78,11 +79,7 @@ def _compiled_kernel() -> Callable[..., None]:
 
     # error_model="numpy": no test for a zero divisor, which would keep the loop from SIMD.
     # No fastmath: the kernel must give the spikes of the torch loop.
-    compiled = functools.partial(numba.njit, nogil=True, error_model="numpy")
-    try:
-        return compiled(cache=True)(kernel)
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        return compiled()(kernel)
+    return compile_kernel(kernel, error_model="numpy")
 
 
 def run(

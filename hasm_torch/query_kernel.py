@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hasm_torch._compile import compile_kernel
 from hasm_torch.place_code import CODES, PlaceCode
 from hasm_torch.rope3d import rope3d
 
@@ -90,8 +91,6 @@ def encode_query(
 @functools.cache
 def _compiled() -> Callable[..., None]:
     """The pass, compiled on first use and then cached on disk."""
-    import numba
-
     thermometer, gray = CODES.index("thermometer"), CODES.index("gray")
 
     def kernel(
@@ -151,8 +150,4 @@ def _compiled() -> Callable[..., None]:
                         value = np.float32(-1.0) if value < 0 else np.float32(1.0)
                     touch[row, 3 * block + i] = value
 
-    compiled = functools.partial(numba.njit, nogil=True)
-    try:
-        return compiled(cache=True)(kernel)
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        return compiled()(kernel)
+    return compile_kernel(kernel)

@@ -33,6 +33,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hasm_torch._compile import compile_kernel
+
 HOLD_S = 0.06
 WINDOW = 5  # samples over which a cell's reading is averaged to tell it from noise
 LONG_WINDOW = 25  # samples over which the levels of noise and offset are taken
@@ -159,7 +161,6 @@ class Footprint:
 @functools.cache
 def _compiled() -> Callable[..., tuple[int, int, int]]:
     """The pass, compiled on first use and then cached on disk."""
-    import numba
 
     def kernel(
         skin: Any, borders: Any, footprint: Any, hold: int, probation: int, last: Any, missed: int,
@@ -256,8 +257,4 @@ def _compiled() -> Callable[..., tuple[int, int, int]]:
                             skin[t, c, i] = share / 3.0
         return missed, seen, stirred
 
-    compiled = functools.partial(numba.njit, nogil=True)
-    try:
-        return compiled(cache=True)(kernel)
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        return compiled()(kernel)
+    return compile_kernel(kernel)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hasm_torch._compile import compile_kernel
 from hasm_torch.izhikevich import Izhikevich
 from hasm_torch.izhikevich_kernel import run
 
@@ -65,7 +66,6 @@ def encode_skin(
 @functools.cache
 def _compiled() -> Callable[..., None]:
     """The pass, compiled on first use and then cached on disk."""
-    import numba
 
     def kernel(skin: Any, borders: Any, threshold: Any, totals: Any, force: Any) -> None:
         zero = np.float32(0.0)
@@ -87,8 +87,4 @@ def _compiled() -> Callable[..., None]:
                         mean += totals[s, t + i, p]
                     force[s, t, p] = mean / np.float32(window)
 
-    compiled = functools.partial(numba.njit, nogil=True)
-    try:
-        return compiled(cache=True)(kernel)
-    except RuntimeError:  # neither the package's folder nor the user's cache can be written
-        return compiled()(kernel)
+    return compile_kernel(kernel)
