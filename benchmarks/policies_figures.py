@@ -6,9 +6,22 @@ from typing import Any
 from benchmarks.policies_report import CONDITIONS, DEFAULT, UNHARMED, wilson
 from hasm_torch.evaluation.runner import EXPERIMENTS
 
-GENERALISATION = ("force", "posture", "start_noise", "object", "demonstrations")
-FAULTS = ("dead", "noise", "lost", "offset", "stuck")
-ALONE = {"posture": "compliance", "start_noise": "grasp", "object": "grasp"}
+# Panels, down the columns of two.
+Panel = tuple[str, str]
+GENERALISATION: tuple[Panel, ...] = (
+    ("compliance", "force"),
+    ("grasp", "force"),
+    ("compliance", "posture"),
+    ("grasp", "start_noise"),
+    ("compliance", "demonstrations"),
+    ("grasp", "demonstrations"),
+    ("grasp", "object"),
+)
+FAULTS: tuple[Panel, ...] = tuple(
+    (experiment, fault)
+    for fault in ("dead", "noise", "lost", "offset", "stuck")
+    for experiment in EXPERIMENTS
+)
 
 
 def draw_all(
@@ -22,8 +35,9 @@ def draw_all(
         directory: Where the pictures go.
     """
     paths = [draw_contestants(ranked, directory / "policies.png")] if ranked else []
-    for name, conditions in (("generalisation", GENERALISATION), ("faults", FAULTS)):
-        found = [c for c in conditions if any(p["condition"] == c for p in curves)]
+    drawn = {(point["experiment"], point["condition"]) for point in curves}
+    for name, panels in (("generalisation", GENERALISATION), ("faults", FAULTS)):
+        found = [panel for panel in panels if panel in drawn]
         if found:
             paths.append(draw_curves(curves, found, directory / f"policies_{name}.png"))
     crowds = [point for point in curves if point["condition"] == "crowding" and point["level"]]
@@ -53,25 +67,24 @@ def draw_contestants(entries: list[dict[str, Any]], path: Path) -> Path:
     return path
 
 
-def draw_curves(curves: list[dict[str, Any]], conditions: list[str], path: Path) -> Path:
-    """Success rate against some conditions, a row of panels an experiment."""
+def draw_curves(curves: list[dict[str, Any]], panels: list[Panel], path: Path) -> Path:
+    """Success rate against some conditions, a panel each."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(1.5 + 2.6 * len(conditions), 5.6), layout="constrained")
-    grid = figure.subplots(2, len(conditions), squeeze=False, sharey=True)
+    columns = -(-len(panels) // 2)
+    figure = Figure(figsize=(1.5 + 2.6 * columns, 5.6), layout="constrained")
+    grid = figure.subplots(2, columns, squeeze=False, sharey=True)
     names = list(dict.fromkeys(point["contestant"] for point in curves))
-    for row, experiment in zip(grid, EXPERIMENTS):
-        for axes, condition in zip(row, conditions):
-            if ALONE.get(condition, experiment) != experiment:
-                axes.set_axis_off()
-                continue
-            for shift, name in enumerate(names):
-                mine = _curve(curves, name, condition, experiment)
-                if mine:
-                    _draw_curve(axes, mine, name, shift)
-            axes.set(xlabel=CONDITIONS[condition], ylim=(-0.04, 1.04))
-            axes.set_ylabel(f"{experiment}: success rate")
-            axes.grid(alpha=0.3)
+    for axes in grid.T.flat[len(panels) :]:
+        axes.set_axis_off()
+    for axes, (experiment, condition) in zip(grid.T.flat, panels):
+        for shift, name in enumerate(names):
+            mine = _curve(curves, name, condition, experiment)
+            if mine:
+                _draw_curve(axes, mine, name, shift)
+        axes.set(xlabel=CONDITIONS[condition], ylim=(-0.04, 1.04))
+        axes.set_ylabel(f"{experiment}: success rate")
+        axes.grid(alpha=0.3)
     legend: dict[str, Any] = {}
     for axes in grid.flat:
         handles, labels = axes.get_legend_handles_labels()
