@@ -73,7 +73,7 @@ def contestants(entries: list[dict[str, Any]]) -> str:
             name,
             *(f"{result['successes']}/{result['rollouts']}" for result in both),
             f"{order:.2f}",
-            f"{sum(result['train_seconds'] for result in both):.3g} s",
+            f"{sum(result['train_seconds'] for result in both):.1f} s",
             f"{sum(result['memory_bytes'] for result in both) / 1e3:,.0f} kB",
             f"{max(yielding['step_ms'], grasping['step_ms']):.2f} ms",
         ]
