@@ -26,8 +26,8 @@ def anneal(scores: Tensor, perplexity: Tensor | float) -> Tensor:
             nearly equal.
 
     Returns:
-        (..., K) weights that sum to 1. Associations that tie for the best share the weight even
-        where they are more than P.
+        (..., K) weights that sum to 1. Associations that tie for the best, or lag behind it by less
+        than some thousandth of the mean lag, share the weight even where they are more than P.
     """
     lag = scores.amax(-1, keepdim=True) - scores
     lag = lag / lag.mean(-1, keepdim=True).clamp(min=torch.finfo(lag.dtype).tiny)
