@@ -25,8 +25,9 @@ from benchmarks.machine import RESULTS, interleaved, print_machine, save_json
 from hasm_torch import HASM, Body, HASMConfig
 from hasm_torch.command_line import parse_options
 from hasm_torch.config import MemoryShape
+from hasm_torch.readings import pressed
 
-JOINTS, PATCHES, CELLS, POINTS = 8, 8, 7, 3
+JOINTS, PATCHES, CELLS = 8, 8, 7
 TOUCHED = "patch_0"
 
 # Force on the touched patch, N: between these, over so many control steps.
@@ -75,23 +76,12 @@ def build_model(associations: int) -> HASM:
     phase = torch.arange(JOINTS).float()
     walk = 1.3 * torch.sin((1 + torch.arange(JOINTS) % 3) * turn.unsqueeze(1) + phase)
     way = (walk.diff(dim=0).abs() / 3.0).amax(-1)
-    counts, _, _ = model.skin(pressed(5.0).expand(50, -1, -1))
+    counts, _, _ = model.skin(pressed(body, TOUCHED, 5.0).expand(50, -1, -1))
     pace = counts[:, 0].mean() / way
     memory.write(walk[:-1], torch.full((associations,), 0.4), walk[1:], pace)
     memory.memory.beta.fill_(memory.memory.crowding().beta)
     model.reset()
     return model
-
-
-def pressed(force: float) -> Tensor:
-    """Skin on which only the touched patch is pressed, (cells, points), N.
-
-    Args:
-        force: Sum over the patch, N.
-    """
-    skin = torch.zeros(PATCHES * CELLS, POINTS)
-    skin[:CELLS] = force / (CELLS * POINTS)
-    return skin
 
 
 def start_position(model: HASM) -> Tensor:
@@ -114,7 +104,7 @@ def roll_out(model: HASM, steps: int) -> np.ndarray:
     seconds = np.empty((2, steps))
     for step in range(steps):
         wave = 0.5 - 0.5 * math.cos(2 * math.pi * step / FORCE_PERIOD)
-        skin = pressed(FORCE_LOW + (FORCE_HIGH - FORCE_LOW) * wave)
+        skin = pressed(model.body, TOUCHED, FORCE_LOW + (FORCE_HIGH - FORCE_LOW) * wave)
         clock, computed = time.perf_counter(), time.thread_time()
         state = model.step(state, skin)
         computed_after = time.thread_time()
@@ -171,7 +161,7 @@ def parts(model: HASM, rounds: int) -> dict[str, np.ndarray]:
         For each part (rounds,) seconds.
     """
     skin, memory = model.skin, model.memory(TOUCHED)
-    sample = pressed(5.0).unsqueeze(0)
+    sample = pressed(model.body, TOUCHED, 5.0).unsqueeze(0)
     _, force, state = skin(sample, model.rollout.skin)
     drive = skin.current_per_newton * force[0].unsqueeze(-1).expand(-1, skin.steps).contiguous()
     reference, density = model.reference, model.density[0]

@@ -36,6 +36,27 @@ class Crowding:
     beta: float
 
 
+def judged_rows(held: int, code_dim: int) -> Tensor:
+    """Evenly spread rows of a memory that are judged against all others, (J,).
+
+    Args:
+        held: Associations held.
+        code_dim: Length of their codes.
+    """
+    return torch.arange(0, held, max(1, math.ceil(held**2 * code_dim / LARGEST_WORK)))
+
+
+def fitting_beta(held: int, margin: float, confidence: float = 1e6) -> float:
+    """β at which the right association outweighs all others, see ``crowding``.
+
+    Args:
+        held: Different associations held, K.
+        margin: Smallest lead of one over the others, inner product.
+        confidence: Ratio of its weight to all others together.
+    """
+    return math.log(max(confidence * max(held - 1, 1), math.e)) / max(margin, 1e-6)
+
+
 def crowding(associations: Tensor, capacity: int, confidence: float = 1e6) -> Crowding:
     """Judge stored associations.
 
@@ -63,14 +84,13 @@ def crowding(associations: Tensor, capacity: int, confidence: float = 1e6) -> Cr
     held = len(associations)
     stored = associations[_distinct(associations)].float()
     own = (stored**2).sum(-1)
-    step = max(1, math.ceil(len(stored) ** 2 * stored.shape[1] / LARGEST_WORK))
-    rows = torch.arange(0, len(stored), step, device=stored.device)
+    rows = judged_rows(*stored.shape).to(stored.device)
     rival = torch.cat([_best_rival(stored, part) for part in rows.split(512)])
     lead = own[rows] - rival
     alone = len(stored) == 1
     margin = float(own[0]) if alone else float(lead.min())
     crosstalk = 0.0 if alone else float((rival / own[rows]).mean())
-    beta = math.log(max(confidence * max(len(stored) - 1, 1), math.e)) / max(margin, 1e-6)
+    beta = fitting_beta(len(stored), margin, confidence)
     return Crowding(held, capacity, held - len(stored), margin, crosstalk, beta)
 
 

@@ -287,7 +287,8 @@ class HASM(nn.Module):
         """Where a new touch begins, take up joints that were moved meanwhile."""
         assert walk.reference is not None
         onset = ONSET_AFTER * self.body.rate
-        if any(walk.quiet.get(patch, onset) >= onset for patch in touched):
+        anew = [patch for patch in touched if walk.quiet.get(patch, onset) >= onset]
+        if anew:
             away = np.abs(measured - walk.reference) > self.tolerance.cpu().numpy()
             if away.any():
                 held = np.clip(measured, self._lower, self._upper)
@@ -296,9 +297,8 @@ class HASM(nn.Module):
         for patch in list(walk.goals):
             if touched and patch not in touched:
                 del walk.goals[patch]  # another patch leads away from this goal
-        for patch in touched:
-            if walk.quiet.get(patch, onset) >= onset:
-                walk.levels.pop(patch, None)  # how strong the new touch is shows later
+        for patch in anew:
+            walk.levels.pop(patch, None)  # how strong the new touch is shows later
         for patch in self.patches:
             walk.quiet[patch] = 0 if patch in touched else walk.quiet.get(patch, 0) + 1
 

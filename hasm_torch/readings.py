@@ -7,7 +7,11 @@ strength reach the memory as those of six patches; its torques are left aside. A
 has one cell that is touched steadily, so that its memory plays back sequences at their own pace.
 """
 
+import functools
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hasm_torch.config import Body
@@ -51,6 +55,18 @@ def as_forces(readings: Tensor) -> Tensor:
     return torch.nn.functional.pad(pushes.flatten(-2).unsqueeze(-1), (0, FORCES - PRESSURE))
 
 
+@functools.cache
+def patch_borders(cells: tuple[int, ...]) -> NDArray[np.int64]:
+    """First cell of each patch, and behind the last one the number of all cells, (P + 1,).
+
+    Args:
+        cells: Number of cells of each patch; patches follow each other.
+    """
+    borders = np.concatenate([[0], np.cumsum(cells)])
+    borders.flags.writeable = False  # all callers share it
+    return borders
+
+
 def pressed(body: Body, patch: str, force: float) -> Tensor:
     """Forces of a robot's cells while one patch is pressed evenly.
 
@@ -63,9 +79,9 @@ def pressed(body: Body, patch: str, force: float) -> Tensor:
         (cells, 3), N.
     """
     index = body.patches.index(patch)
-    first, count = sum(body.cells[:index]), body.cells[index]
-    skin = torch.zeros(sum(body.cells), FORCES)
-    skin[first : first + count] = force / (FORCES * count)
+    borders = patch_borders(tuple(body.cells))
+    skin = torch.zeros(int(borders[-1]), FORCES)
+    skin[borders[index] : borders[index + 1]] = force / (FORCES * body.cells[index])
     return skin
 
 

@@ -9,11 +9,11 @@ of External Forces" of the paper.
 import math
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hasm_torch.izhikevich import Izhikevich, IzhikevichState, resting_state
+from hasm_torch.readings import patch_borders
 from hasm_torch.skin_kernel import encode_skin
 from hasm_torch.touch import cell_excess
 
@@ -99,7 +99,7 @@ class SkinEncoder(nn.Module):
         self.threshold, self.window = threshold, window
         self.current_per_newton = current_per_newton
         self.neuron = Izhikevich(dt_ms=spike_dt_ms)
-        self._borders = np.concatenate([[0], np.cumsum(cells)])
+        self._borders = patch_borders(tuple(cells))
         patch_of_cell = torch.repeat_interleave(torch.arange(len(cells)), torch.tensor(cells))
         self.register_buffer("patch_of_cell", patch_of_cell)
 

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hasm_torch._compile import compile_kernel
+from hasm_torch.readings import patch_borders
 
 HOLD_S = 0.06
 WINDOW = 5  # samples over which a cell's reading is averaged to tell it from noise
@@ -117,7 +118,7 @@ def clean_skin(
         )
     state = FilterState.start(total) if state is None else state
     cleaned = skin.detach().float().cpu().numpy().copy()
-    borders = np.concatenate([[0], np.cumsum(cells)])
+    borders = patch_borders(tuple(cells))
     state.missed, state.seen, state.stirred = _compiled()(
         cleaned, borders, footprint, round(HOLD_S * rate), round(PROBATION_S * rate), state.last,
         state.missed, state.seen, state.readings, state.changes, state.stuck, state.stirred,
@@ -133,7 +134,7 @@ class Footprint:
     """
 
     def __init__(self, cells: list[int]) -> None:
-        self._borders = np.concatenate([[0], np.cumsum(cells)])
+        self._borders = patch_borders(tuple(cells))
         self._total: NDArray[np.float64] = np.zeros(sum(cells))
         self._touches = np.zeros(sum(cells), np.int64)
         self._always = np.ones(sum(cells), np.bool_)

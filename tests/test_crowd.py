@@ -8,7 +8,7 @@ import torch
 from toys import Recorded, make_body, press, record, smooth_path
 
 from benchmarks.baselines.crowd import crowded, known_states, random_motions
-from benchmarks.baselines.crowd_measures import codes_of, fitting_beta, margin, step_times
+from benchmarks.baselines.crowd_measures import beta_of, codes_of, margin, step_times
 from hasm_torch import HASM, HASMConfig
 from hasm_torch.lerobot.body import body_of
 from hasm_torch.lerobot.episodes import load_episodes
@@ -137,7 +137,7 @@ def test_margin_and_beta_agree_with_brute_force():
     expected = (leads[0], leads[fifth], unrelated[0], unrelated[fifth])
     assert margin(memory, learned) == pytest.approx(expected)
     assert margin(model.memory("front").memory, learned)[2:] == (np.inf, np.inf)
-    assert fitting_beta(memory) == pytest.approx(memory.crowding().beta, rel=1e-6)
+    assert beta_of(memory) == pytest.approx(memory.crowding().beta, rel=1e-6)
     assert float(memory.beta) == pytest.approx(memory.crowding().beta, rel=1e-6)
 
 

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from benchmarks.baselines.crowd_measures import fitting_beta
+from benchmarks.baselines.crowd_measures import beta_of
 from hasm_torch.config import MemoryShape
 from hasm_torch.hasm import HASM
 from hasm_torch.learning import Recording
@@ -129,7 +129,7 @@ def crowded(
             patch, MemoryShape(shape.joints, max(capacity, 1), shape.touch_levels)
         )
         new.write(target)
-        beta = config.beta if config.beta is not None else fitting_beta(target.memory)
+        beta = config.beta if config.beta is not None else beta_of(target.memory)
         target.memory.beta.fill_(beta)
         stored[patch] = new.stored
     full.reset()

@@ -13,15 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hasm_torch.crowding import LARGEST_WORK
+from hasm_torch.crowding import fitting_beta, judged_rows
 from hasm_torch.evaluation.grasp import GRASP_PATCH, REACH_PATCH
 from hasm_torch.hasm import HASM
 from hasm_torch.memory import HeteroAssociativeMemory
 from hasm_torch.readings import pressed
 from hasm_torch.recall.packed import ROWS, unpack
-
-# Weight of the right association over all others together, as ``HASM.fit`` asks for.
-CONFIDENCE = 1e6
 
 # Associations that are asked for in one recall.
 QUERIES_AT_ONCE = 16
@@ -94,7 +91,7 @@ def margin(memory: HeteroAssociativeMemory, learned: int) -> Margin:
     )
 
 
-def fitting_beta(memory: HeteroAssociativeMemory) -> float:
+def beta_of(memory: HeteroAssociativeMemory) -> float:
     """β as ``HASM.fit`` derives it by ``crowding``, from the packed codes.
 
     Args:
@@ -105,11 +102,10 @@ def fitting_beta(memory: HeteroAssociativeMemory) -> float:
         ``crowding`` judges.
     """
     held = int(memory.count)
-    step = max(1, math.ceil(held**2 * memory.code_dim / LARGEST_WORK))
-    judged = torch.arange(0, held, step).split(QUERIES_AT_ONCE)
+    judged = judged_rows(held, memory.code_dim).split(QUERIES_AT_ONCE)
     leads = torch.cat([memory.inspect(codes_of(memory, rows)).margin for rows in judged])
     smallest = float(leads.min()) if held > 1 else memory.code_dim
-    return math.log(CONFIDENCE * max(held - 1, 1)) / max(smallest, 1e-6)
+    return fitting_beta(held, smallest)
 
 
 def codes_of(memory: HeteroAssociativeMemory, rows: Tensor) -> Tensor:
