@@ -9,7 +9,7 @@ import sys
 
 import torch
 
-from hasm_torch.command_line import parse_options
+from hasm_torch.apps.command_line import parse_options
 from hasm_torch.evaluation.evaluate import EvalConfig, evaluate
 from hasm_torch.evaluation.open_loop import OpenLoopConfig, open_loop
 

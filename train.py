@@ -5,8 +5,8 @@ uv run train.py --dataset.root=datasets/hsr_compliance --output_dir=outputs/trai
 
 import sys
 
-from hasm_torch.command_line import parse_options
-from hasm_torch.training import TrainConfig, describe, settings, train
+from hasm_torch.apps.command_line import parse_options
+from hasm_torch.apps.training import TrainConfig, describe, settings, train
 
 
 def main() -> None:

@@ -23,9 +23,9 @@ from torch import Tensor
 
 from benchmarks.machine import RESULTS, interleaved, print_machine, save_json
 from hasm_torch import HASM, Body, HASMConfig
-from hasm_torch.command_line import parse_options
+from hasm_torch.apps.command_line import parse_options
 from hasm_torch.config import MemoryShape
-from hasm_torch.readings import pressed
+from hasm_torch.encoders.readings import pressed
 
 JOINTS, PATCHES, CELLS = 8, 8, 7
 TOUCHED = "patch_0"

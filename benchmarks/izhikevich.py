@@ -22,7 +22,7 @@ from torch import Tensor
 
 from benchmarks.machine import RESULTS, interleaved, print_machine, save_json
 from hasm_torch import Izhikevich
-from hasm_torch.command_line import parse_options
+from hasm_torch.apps.command_line import parse_options
 
 INSTALL_NORSE = """norse is not installed, so there is no comparison; to get one:
   uv pip install --target=outputs/norse --no-deps norse nir nirtorch h5py

@@ -34,7 +34,7 @@ from benchmarks.machine import RESULTS, print_machine, save_json
 from benchmarks.policies_bench import Bench, Cell
 from benchmarks.policies_figures import draw_all
 from benchmarks.policies_report import curve_table, goal_table, goals, pool, table
-from hasm_torch.command_line import parse_options
+from hasm_torch.apps.command_line import parse_options
 
 COMPARED = ("default", TUNED_NEIGHBOURS)
 # Levels of every condition. Compliance and grasps are rolled out where both have a meaning.

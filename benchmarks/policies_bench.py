@@ -18,15 +18,15 @@ from benchmarks.baselines.crowd import crowded
 from benchmarks.baselines.crowd_measures import margin, step_times
 from benchmarks.baselines.faults import Fault, FaultySkin, Kind
 from benchmarks.baselines.learned_training import Training
-from hasm_torch.config import Body
+from hasm_torch.body import Body
+from hasm_torch.data.body import body_of
+from hasm_torch.data.episodes import Episode, load_episodes
+from hasm_torch.encoders.readings import pressed
 from hasm_torch.evaluation import combined, compliance, grasp
 from hasm_torch.evaluation.evaluate import TIMED_FORCE
 from hasm_torch.evaluation.rollout import Array, Policy
 from hasm_torch.evaluation.runner import EXPERIMENTS, make_env, run_case
-from hasm_torch.hasm import HASM
-from hasm_torch.lerobot.body import body_of
-from hasm_torch.lerobot.episodes import Episode, load_episodes
-from hasm_torch.readings import pressed
+from hasm_torch.model.hasm import HASM
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.demonstrator import POSTURE, compliance_episodes, grasp_episodes
 from hasm_torch.sim.poses import START_POSES

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hasm_torch.recall import recall_packed, unpack
+from hasm_torch.memory.recall import recall_packed, unpack
 
 VALUES = 8  # joints
 BETA = 1.0

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 
 from hasm_torch import binarise, functional
-from hasm_torch.command_line import parse_options
+from hasm_torch.apps.command_line import parse_options
 
 
 @dataclass

@@ -1,13 +1,15 @@
 """Hetero-associative sequential memory for touch-driven robots, as PyTorch modules."""
 
-from hasm_torch.bipolar import binarise, bind, to_bipolar
-from hasm_torch.config import Body, HASMConfig
-from hasm_torch.hasm import HASM
-from hasm_torch.izhikevich import Izhikevich, IzhikevichState
-from hasm_torch.memory import HeteroAssociativeMemory
-from hasm_torch.place_code import PlaceCode
-from hasm_torch.rope3d import RoPE3D, rope3d, touch_rotation
-from hasm_torch.touch import EffectiveForce, TactileEmbedding
+from hasm_torch.body import Body
+from hasm_torch.config import HASMConfig
+from hasm_torch.encoders.bipolar import binarise, bind, to_bipolar
+from hasm_torch.encoders.izhikevich import Izhikevich, IzhikevichState
+from hasm_torch.encoders.place_code import PlaceCode
+from hasm_torch.encoders.rope3d import RoPE3D, rope3d, touch_rotation
+from hasm_torch.encoders.touch import EffectiveForce, TactileEmbedding
+from hasm_torch.memory import functional
+from hasm_torch.memory.layer import HeteroAssociativeMemory
+from hasm_torch.model.hasm import HASM
 
 __all__ = [
     "HASM",
@@ -22,6 +24,7 @@ __all__ = [
     "TactileEmbedding",
     "binarise",
     "bind",
+    "functional",
     "rope3d",
     "to_bipolar",
     "touch_rotation",

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from hasm_torch.bipolar import binarise, bind, to_bipolar
+from hasm_torch.encoders.bipolar import binarise, bind, to_bipolar
 
 
 def test_to_bipolar_writes_zeros_as_minus_one():

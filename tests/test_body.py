@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hasm_torch import HASM, HASMConfig
-from hasm_torch.checkpoint import TACTILE, features
-from hasm_torch.config import Body
-from hasm_torch.lerobot import (
+from hasm_torch.apps.training import FeaturesConfig, RobotConfig, describe, train
+from hasm_torch.body import Body
+from hasm_torch.data import (
     Episode,
     EpisodeSet,
     EpisodeStream,
@@ -26,10 +26,10 @@ from hasm_torch.lerobot import (
     open_episodes,
     write_episodes,
 )
-from hasm_torch.lerobot.body import body_of, describe_body, limits_of
-from hasm_torch.readings import DIRECTIONS, as_forces, forces_of
-from hasm_torch.skin_encoder import spike_step
-from hasm_torch.training import FeaturesConfig, RobotConfig, describe, train
+from hasm_torch.data.body import body_of, describe_body, limits_of
+from hasm_torch.encoders.readings import DIRECTIONS, as_forces, forces_of
+from hasm_torch.encoders.skin import spike_step
+from hasm_torch.model.checkpoint import TACTILE, features
 
 RECORDINGS = Path(__file__).parents[2] / "shared" / "data"
 URDF = """<robot name="made">

@@ -9,6 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from hasm_torch.apps.training import train
 from hasm_torch.config import HASMConfig
 from hasm_torch.evaluation.combined import (
     LARGEST_ANGLE,
@@ -24,7 +25,6 @@ from hasm_torch.evaluation.combined import (
 from hasm_torch.evaluation.compliance import BEHAVIOURS, END_MARGIN, RELEASE_AT, ROOM, TOUCH_AT
 from hasm_torch.evaluation.runner import make_env
 from hasm_torch.robot import JOINTS, PATCHES
-from hasm_torch.training import train
 
 PERIOD = 0.02
 LOWER = np.linspace(-2.0, -1.0, len(JOINTS))

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.control import RECALLS_A_STEP, SPEED_SHARE, Walk, advance, limit_speed
+from hasm_torch.model.control import RECALLS_A_STEP, SPEED_SHARE, Walk, advance, limit_speed
 
 LOWER, UPPER = np.array([-1.0, 0.0]), np.array([1.0, 4.0])
 DENSITY = 0.5

@@ -10,9 +10,9 @@ from toys import Recorded, make_body, press, record, smooth_path
 from benchmarks.baselines.crowd import crowded, known_states, random_motions
 from benchmarks.baselines.crowd_measures import beta_of, codes_of, margin, step_times
 from hasm_torch import HASM, HASMConfig
-from hasm_torch.lerobot.body import body_of
-from hasm_torch.lerobot.episodes import load_episodes
-from hasm_torch.recall import inspect_packed, pack
+from hasm_torch.data.body import body_of
+from hasm_torch.data.episodes import load_episodes
+from hasm_torch.memory.recall import inspect_packed, pack
 from hasm_torch.sim.poses import START_POSES
 
 FORCES = (4.0, 8.0)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hasm_torch.lerobot.episodes import load_episodes
+from hasm_torch.data.episodes import load_episodes
 from hasm_torch.robot import JOINTS, PATCHES, Skin
 from hasm_torch.sim.demonstrator import TASKS, compliance_episodes, grasp_episodes
 from hasm_torch.sim.env import CONTROL_RATE, HSRTouchEnv

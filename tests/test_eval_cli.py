@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from hasm_torch import HASM
+from hasm_torch.apps.training import train
 from hasm_torch.evaluation.evaluate import EvalConfig, evaluate
-from hasm_torch.training import train
 
 ROOT = Path(__file__).parents[1]
 DATASETS = ROOT / "datasets"

@@ -7,14 +7,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch import izhikevich_kernel
-from hasm_torch.izhikevich import (
+from hasm_torch.encoders.izhikevich import (
     Izhikevich,
     IzhikevichState,
     _torch_loop,
     izhikevich,
     resting_state,
 )
+from hasm_torch.kernels import izhikevich as izhikevich_kernel
 
 TABLE = {"a": 0.02, "b": 0.2, "c": -50.0, "d": 0.5, "v_th": 30.0}
 CURRENTS = (4.0, 5.0, 10.0, 20.0, 40.0)

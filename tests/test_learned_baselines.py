@@ -12,8 +12,8 @@ from toys import limits, make_body, press
 from benchmarks.baselines.demonstrations import Series, series_of
 from benchmarks.baselines.learned import Outcome, Scaling, act, diffusion
 from benchmarks.baselines.learned_training import Span, Training, gather, split
-from hasm_torch.config import Body
-from hasm_torch.lerobot.episodes import Episode
+from hasm_torch.body import Body
+from hasm_torch.data.episodes import Episode
 
 Train = Callable[..., Outcome]
 SPAN = Span(-2, 15)

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.lerobot import FeatureMap, load_episodes, windows
+from hasm_torch.data import FeatureMap, load_episodes, windows
 
 FPS = 10
 LENGTHS = (4, 1, 7)
@@ -417,7 +417,7 @@ def test_names_and_units_that_do_not_fit(broken):
 
 def test_reading_does_not_import_lerobot(whole):
     code = (
-        "import sys; from hasm_torch.lerobot import load_episodes; assert 'pyarrow' not in "
+        "import sys; from hasm_torch.data import load_episodes; assert 'pyarrow' not in "
         f"sys.modules; load_episodes({str(whole)!r}); assert 'lerobot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])

@@ -19,8 +19,8 @@ from safetensors.torch import load_file, save_file
 
 from hasm_torch import HASM
 from hasm_torch.config import HASMConfig as Settings
-from hasm_torch.lerobot import load_episodes
-from hasm_torch.lerobot.body import body_of
+from hasm_torch.data import load_episodes
+from hasm_torch.data.body import body_of
 from hasm_torch.lerobot.configuration_hasm import HASMConfig
 from hasm_torch.lerobot.modeling_hasm import HASMPolicy
 

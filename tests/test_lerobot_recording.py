@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hasm_torch.lerobot import (
+from hasm_torch.data import (
     Episode,
     SkinPatch,
     load_episodes,

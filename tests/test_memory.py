@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hasm_torch import HeteroAssociativeMemory, functional
-from hasm_torch.bipolar import binarise
-from hasm_torch.rope3d import rope3d
+from hasm_torch.encoders.bipolar import binarise
+from hasm_torch.encoders.rope3d import rope3d
 
 STORAGES = ("float32", "bfloat16", "int8", "bit")
 

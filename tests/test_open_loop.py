@@ -12,7 +12,10 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.config import Body
+from hasm_torch.apps.training import DatasetConfig
+from hasm_torch.body import Body
+from hasm_torch.data import Episode, EpisodeSet, SkinPatch, load_episodes, write_episodes
+from hasm_torch.encoders.place_code import PlaceCode
 from hasm_torch.evaluation import open_loop as evaluation
 from hasm_torch.evaluation.open_loop import (
     OpenLoopConfig,
@@ -21,14 +24,11 @@ from hasm_torch.evaluation.open_loop import (
     predict_fold,
     relative_errors,
 )
-from hasm_torch.lerobot import Episode, EpisodeSet, SkinPatch, load_episodes, write_episodes
-from hasm_torch.place_code import PlaceCode
 from hasm_torch.prediction import JointPredictor, PredictionSettings, TouchRates, anneal, moments
 from hasm_torch.prediction.annealing import perplexity
 from hasm_torch.prediction.neighbours import NeighbourRegression, NeighbourSettings
 from hasm_torch.prediction.own_codes import OwnCodes
 from hasm_torch.prediction.predictor import int8_scores
-from hasm_torch.training import DatasetConfig
 
 RECORDINGS = Path(__file__).parents[2] / "shared" / "data"
 FPS = 10.0

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from toys import limits, make_body, smooth_path
 
 from hasm_torch.config import HASMConfig, MemoryShape
-from hasm_torch.patch_memory import PatchMemory
-from hasm_torch.successors import distinct_links
+from hasm_torch.memory.successors import distinct_links
+from hasm_torch.model.patch_memory import PatchMemory
 
 BODY = make_body(4)
 MOVED = [0, 2, 3]

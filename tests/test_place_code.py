@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.place_code import CODES, PlaceCode, place_code, quantise, spike_rates
+from hasm_torch.encoders.place_code import CODES, PlaceCode, place_code, quantise, spike_rates
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 LOWER, UPPER = [0.0, -2.62, -1.9], [0.69, 0.0, 3.8]

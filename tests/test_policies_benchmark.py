@@ -28,10 +28,10 @@ from benchmarks.baselines.policies import (
 )
 from benchmarks.policies_bench import Cell, plan, some_episodes, start_of
 from benchmarks.policies_report import CONDITIONS, goals, pool, wilson
-from hasm_torch.config import Body
+from hasm_torch.body import Body
+from hasm_torch.data.episodes import Episode
 from hasm_torch.evaluation.rollout import Policy
 from hasm_torch.evaluation.runner import EXPERIMENTS
-from hasm_torch.lerobot.episodes import Episode
 
 
 @dataclass

@@ -18,8 +18,8 @@ from hasm_torch import (
     bind,
     touch_rotation,
 )
-from hasm_torch.successors import shifted_links
-from hasm_torch.touch import EffectiveForce
+from hasm_torch.encoders.touch import EffectiveForce
+from hasm_torch.memory.successors import shifted_links
 
 BODY = make_body(3)
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.recall import inspect_dense, recall_dense, recall_weights
+from hasm_torch.memory.recall import inspect_dense, recall_dense, recall_weights
 
 
 def reference(query, associations, successors, beta, taking_part=None):
@@ -73,7 +73,7 @@ def test_every_storage_of_bipolar_codes_decides_alike(dtype):
 
 def test_narrow_storage_is_widened_in_parts(monkeypatch):
     codes, successors, _ = memory(2, 50, 16, 2)
-    monkeypatch.setattr("hasm_torch.recall.dense._WIDENED_ENTRIES", 16 * 7)
+    monkeypatch.setattr("hasm_torch.memory.recall.dense._WIDENED_ENTRIES", 16 * 7)
     decision = recall_dense(
         torch.from_numpy(codes[3]).float(),
         torch.from_numpy(codes).to(torch.int8),

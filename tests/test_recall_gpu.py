@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import pytest
 import torch
 
-from hasm_torch.recall import Recall, inspect_packed, pack
+from hasm_torch.memory.recall import Recall, inspect_packed, pack
 
 # (batch, rows, dim, queries, values, beta, masked)
 CASES = [
@@ -48,8 +48,8 @@ def assert_same(found, expected):
 
 
 def compare_interpreted():
-    from hasm_torch.recall.packed import _pack_codes
-    from hasm_torch.recall.packed_gpu import scan_gpu
+    from hasm_torch.memory.recall.packed import _pack_codes
+    from hasm_torch.memory.recall.packed_gpu import scan_gpu
 
     for case in CASES:
         query, *memory = draw(*case)

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.recall import inspect_packed, pack, recall_packed, store, unpack
+from hasm_torch.memory.recall import inspect_packed, pack, recall_packed, store, unpack
 
 ROWS = 64
 
@@ -41,7 +41,7 @@ def check(found, expected):
 @pytest.fixture
 def team(monkeypatch):
     """Lets even a small memory be scanned by a team of threads."""
-    monkeypatch.setattr("hasm_torch.recall.packed_cpu._TEAM_WORDS", 0)
+    monkeypatch.setattr("hasm_torch.memory.recall.packed_cpu._TEAM_WORDS", 0)
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     yield
@@ -114,7 +114,7 @@ def test_the_answer_does_not_depend_on_the_number_of_threads(team):
 
 
 def test_python_threads_stand_in_for_openmp(team, monkeypatch):
-    from hasm_torch.recall import packed_cpu
+    from hasm_torch.memory.recall import packed_cpu
 
     kernel = packed_cpu._load_kernel()
     monkeypatch.setattr(

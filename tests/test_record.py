@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from hasm_torch.lerobot import load_episodes
-from hasm_torch.lerobot.record import EnvSource, RecordConfig, main, record
+from hasm_torch.apps.record import EnvSource, RecordConfig, main, record
+from hasm_torch.data import load_episodes
 
 
 class Pendulum(gymnasium.Env):

@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.bipolar import to_bipolar
-from hasm_torch.rope3d import RoPE3D, rope3d, touch_rotation
+from hasm_torch.encoders.bipolar import to_bipolar
+from hasm_torch.encoders.rope3d import RoPE3D, rope3d, touch_rotation
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 DIMS = (3, 4, 5, 24, 200)

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.skin_encoder import SkinEncoder
+from hasm_torch.encoders.skin import SkinEncoder
 
 CELLS, RATE = [2, 1, 4], 50.0
 SPANS = [slice(0, 2), slice(2, 3), slice(3, 7)]

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.skin_filter import HOLD_S, PROBATION_S, Footprint, clean_skin
+from hasm_torch.encoders.skin_filter import HOLD_S, PROBATION_S, Footprint, clean_skin
 
 CELLS, RATE = [7, 7, 7, 7, 6, 5], 50.0
 TOTAL = sum(CELLS)

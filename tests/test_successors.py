@@ -4,7 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.successors import distinct_links, shifted_links
+from hasm_torch.memory.successors import distinct_links, shifted_links
 
 ENTRIES = 12
 

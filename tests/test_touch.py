@@ -5,8 +5,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.place_code import PlaceCode
-from hasm_torch.touch import (
+from hasm_torch.encoders.place_code import PlaceCode
+from hasm_torch.encoders.touch import (
     EffectiveForce,
     TactileEmbedding,
     effective_force,

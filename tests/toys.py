@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hasm_torch.config import Body
+from hasm_torch.body import Body
 
 RATE = 50.0
 

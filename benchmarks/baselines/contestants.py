@@ -18,10 +18,11 @@ from benchmarks.baselines.policies import (
     neighbour_candidates,
     tuned_neighbour_candidates,
 )
-from hasm_torch.config import Body, HASMConfig
+from hasm_torch.body import Body
+from hasm_torch.config import HASMConfig
+from hasm_torch.data.episodes import Episode
 from hasm_torch.evaluation.rollout import Policy
-from hasm_torch.hasm import HASM
-from hasm_torch.lerobot.episodes import Episode
+from hasm_torch.model.hasm import HASM
 
 BETAS = (0.1, 0.5, 1.0, 2.0, 5.0, 20.0)
 BINARY_BITS = (2, 4, 6, 8)

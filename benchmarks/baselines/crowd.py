@@ -20,10 +20,10 @@ from torch import Tensor
 
 from benchmarks.baselines.crowd_measures import beta_of
 from hasm_torch.config import MemoryShape
-from hasm_torch.hasm import HASM
-from hasm_torch.learning import Recording
-from hasm_torch.patch_memory import PatchMemory
-from hasm_torch.successors import distinct_links
+from hasm_torch.memory.successors import distinct_links
+from hasm_torch.model.hasm import HASM
+from hasm_torch.model.learning import Recording
+from hasm_torch.model.patch_memory import PatchMemory
 
 # Codes are real numbers for so many states at a time: with 1,280 entries 42 MB a code.
 ROWS_AT_ONCE = 8192

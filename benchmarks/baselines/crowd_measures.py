@@ -13,12 +13,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hasm_torch.crowding import fitting_beta, judged_rows
+from hasm_torch.encoders.readings import pressed
 from hasm_torch.evaluation.grasp import GRASP_PATCH, REACH_PATCH
-from hasm_torch.hasm import HASM
-from hasm_torch.memory import HeteroAssociativeMemory
-from hasm_torch.readings import pressed
-from hasm_torch.recall.packed import ROWS, unpack
+from hasm_torch.memory.crowding import fitting_beta, judged_rows
+from hasm_torch.memory.layer import HeteroAssociativeMemory
+from hasm_torch.memory.recall.packed import ROWS, unpack
+from hasm_torch.model.hasm import HASM
 
 # Associations that are asked for in one recall.
 QUERIES_AT_ONCE = 16

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hasm_torch.config import Body
-from hasm_torch.control import SPEED_SHARE
-from hasm_torch.lerobot.episodes import Episode
+from hasm_torch.body import Body
+from hasm_torch.data.episodes import Episode
+from hasm_torch.model.control import SPEED_SHARE
 
 # Predictions are judged over so many samples of a held-out episode, from every STRIDE-th sample.
 WINDOW, STRIDE = 25, 50

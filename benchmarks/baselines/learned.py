@@ -25,8 +25,8 @@ from benchmarks.baselines.learned_training import (
     fit,
     gather,
 )
-from hasm_torch.config import Body
-from hasm_torch.lerobot.episodes import Episode
+from hasm_torch.body import Body
+from hasm_torch.data.episodes import Episode
 
 Mode = Literal["absolute", "increment"]
 

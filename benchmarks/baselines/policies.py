@@ -20,8 +20,8 @@ from benchmarks.baselines.demonstrations import (
     series_of,
 )
 from hasm_torch import HeteroAssociativeMemory, PlaceCode
-from hasm_torch.config import Body
-from hasm_torch.lerobot.episodes import Episode
+from hasm_torch.body import Body
+from hasm_torch.data.episodes import Episode
 
 Mode = Literal["displacement", "target"]
 MODES: tuple[Mode, ...] = ("displacement", "target")

@@ -12,15 +12,16 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from hasm_torch.config import Body, HASMConfig, write_json
+from hasm_torch.apps.training import DatasetConfig, FeaturesConfig, RobotConfig, settings, train
+from hasm_torch.body import Body
+from hasm_torch.config import HASMConfig, write_json
+from hasm_torch.encoders.readings import pressed
 from hasm_torch.evaluation import compliance, grasp
 from hasm_torch.evaluation.report import table
 from hasm_torch.evaluation.runner import EXPERIMENTS, check_experiments, run_cases
-from hasm_torch.hasm import HASM
-from hasm_torch.readings import pressed
+from hasm_torch.model.hasm import HASM
 from hasm_torch.robot import JOINTS, Skin
 from hasm_torch.sim.env import LARGEST_FORCE
-from hasm_torch.training import DatasetConfig, FeaturesConfig, RobotConfig, settings, train
 
 ROLLOUTS = {"compliance": 40, "grasp": 100}
 TIMED_STEPS = 2000

@@ -18,15 +18,16 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from hasm_torch.config import Body, write_json
-from hasm_torch.lerobot.body import body_of, describe_body
-from hasm_torch.lerobot.episodes import Episode, EpisodeSet, FeatureMap, load_episodes
+from hasm_torch.apps.training import DatasetConfig, FeaturesConfig, RobotConfig
+from hasm_torch.body import Body
+from hasm_torch.config import write_json
+from hasm_torch.data.body import body_of, describe_body
+from hasm_torch.data.episodes import Episode, EpisodeSet, FeatureMap, load_episodes
 from hasm_torch.prediction.neighbours import NEIGHBOURS, NeighbourRegression, NeighbourSettings
 from hasm_torch.prediction.predictor import JointPredictor
 from hasm_torch.prediction.selection import choose_neighbours, choose_settings, frames_back
 from hasm_torch.prediction.series import Series, TouchRates, moments
 from hasm_torch.prediction.settings import PredictionSettings
-from hasm_torch.training import DatasetConfig, FeaturesConfig, RobotConfig
 
 if TYPE_CHECKING:
     from hasm_torch.evaluation.evaluate import EvalConfig
@@ -292,7 +293,7 @@ def table(report: dict[str, Any]) -> str:
 
 def _plot(path: Path, data: EpisodeSet, folds: list[Predicted], report: dict[str, Any]) -> None:
     """Joints that move most, through the first held-out episodes of the first fold."""
-    from hasm_torch.plots import plot_prediction
+    from hasm_torch.evaluation.plots import plot_prediction
 
     fold = folds[0]
     count = min(len(fold.real), max(2, round(PLOT_SECONDS * data.fps)))

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from hasm_torch.evaluation import compliance, grasp
 from hasm_torch.evaluation.rollout import Array, Trace
-from hasm_torch.hasm import HASM
+from hasm_torch.model.hasm import HASM
 
 EXPERIMENTS = ("compliance", "grasp")
 MAX_STEPS = 10_000  # more than any human's patience

@@ -5,16 +5,16 @@ from typing import Any
 
 import numpy as np
 
-from hasm_torch import plots
+from hasm_torch.apps.rerun_recording import Scenes, cell_places, write_recording
+from hasm_torch.evaluation import plots
 from hasm_torch.evaluation.compliance import BEHAVIOURS, ComplianceCase
 from hasm_torch.evaluation.grasp import GraspCase
 from hasm_torch.evaluation.rollout import Array, roll_out
 from hasm_torch.evaluation.runner import make_env, run_case
-from hasm_torch.hasm import HASM
-from hasm_torch.rerun_recording import Scenes, cell_places, write_recording
+from hasm_torch.evaluation.video import caption, write_video
+from hasm_torch.model.hasm import HASM
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.poses import START_POSES
-from hasm_torch.video import caption, write_video
 
 FRAME_EVERY = 2  # control steps, so that videos run at half the control rate
 SHOWN_JOINT = "arm_flex_joint"

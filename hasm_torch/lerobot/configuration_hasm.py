@@ -5,8 +5,9 @@ from dataclasses import dataclass, field
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import SGDConfig
 
-from hasm_torch import config as hasm
-from hasm_torch.checkpoint import ACTION, STATE, TACTILE
+from hasm_torch import config as settings
+from hasm_torch.body import Body
+from hasm_torch.model.checkpoint import ACTION, STATE, TACTILE
 
 
 @PreTrainedConfig.register_subclass("hasm")
@@ -25,9 +26,9 @@ class HASMConfig(PreTrainedConfig):
         normalization_mapping: Nothing is normalised: limits and forces have units.
     """
 
-    model: hasm.HASMConfig = field(default_factory=hasm.HASMConfig)
-    body: hasm.Body | None = None
-    memories: dict[str, hasm.MemoryShape] = field(default_factory=dict)
+    model: settings.HASMConfig = field(default_factory=settings.HASMConfig)
+    body: Body | None = None
+    memories: dict[str, settings.MemoryShape] = field(default_factory=dict)
     dataset: str | None = None
     episodes: list[int] = field(default_factory=list)
     normalization_mapping: dict[str, NormalizationMode] = field(

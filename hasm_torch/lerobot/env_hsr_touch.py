@@ -7,7 +7,7 @@ import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
-from hasm_torch.checkpoint import ACTION, POINTS, STATE, TACTILE
+from hasm_torch.model.checkpoint import ACTION, POINTS, STATE, TACTILE
 from hasm_torch.robot import JOINTS, Skin
 
 GRASP = "grasp"

@@ -17,14 +17,14 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor, nn
 
-from hasm_torch import checkpoint
-from hasm_torch.checkpoint import ACTION, STATE, TACTILE
-from hasm_torch.control import Rollout
-from hasm_torch.hasm import HASM
-from hasm_torch.learning import spike_series
-from hasm_torch.lerobot.body import body_of
+from hasm_torch.data.body import body_of
+from hasm_torch.data.episodes import EpisodeSet, load_episodes
 from hasm_torch.lerobot.configuration_hasm import HASMConfig
-from hasm_torch.lerobot.episodes import EpisodeSet, load_episodes
+from hasm_torch.model import checkpoint
+from hasm_torch.model.checkpoint import ACTION, STATE, TACTILE
+from hasm_torch.model.control import Rollout
+from hasm_torch.model.hasm import HASM
+from hasm_torch.model.learning import spike_series
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata

@@ -7,7 +7,7 @@ two codes is an entry of one table (cells, cells).
 import torch
 from torch import Tensor, nn
 
-from hasm_torch.place_code import PlaceCode
+from hasm_torch.encoders.place_code import PlaceCode
 
 
 class OwnCodes(nn.Module):

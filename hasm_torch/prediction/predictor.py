@@ -17,17 +17,17 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from hasm_torch.bipolar import binarise
-from hasm_torch.config import Body
-from hasm_torch.memory import HeteroAssociativeMemory
-from hasm_torch.place_code import PlaceCode, place_code
+from hasm_torch.body import Body
+from hasm_torch.encoders.bipolar import binarise
+from hasm_torch.encoders.place_code import PlaceCode, place_code
+from hasm_torch.encoders.rope3d import touch_rotation
+from hasm_torch.encoders.touch import TactileEmbedding
+from hasm_torch.kernels.query import block_rotations
+from hasm_torch.memory.layer import HeteroAssociativeMemory
 from hasm_torch.prediction.annealing import anneal
 from hasm_torch.prediction.own_codes import OwnCodes
 from hasm_torch.prediction.series import Moments, thin
 from hasm_torch.prediction.settings import PredictionSettings
-from hasm_torch.query_kernel import block_rotations
-from hasm_torch.rope3d import touch_rotation
-from hasm_torch.touch import TactileEmbedding
 
 # Queries of one block; bounds the (block, joints, shortlist) arrays.
 _BLOCK = 256

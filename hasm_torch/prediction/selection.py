@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hasm_torch.config import Body
+from hasm_torch.body import Body
 from hasm_torch.prediction.neighbours import NeighbourRegression, NeighbourSettings
 from hasm_torch.prediction.predictor import JointPredictor, Recalled
 from hasm_torch.prediction.series import Moments, Series, moments, thin

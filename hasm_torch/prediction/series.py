@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hasm_torch.config import Body
-from hasm_torch.readings import as_forces
-from hasm_torch.skin_encoder import SkinEncoder, spike_step
+from hasm_torch.body import Body
+from hasm_torch.encoders.readings import as_forces
+from hasm_torch.encoders.skin import SkinEncoder, spike_step
 
 # The strongest touch of a recording drives its neuron with this current, which makes it fire at
 # MAX_RATE; the resting level of the cells drives no current.

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from hasm_torch.data.episodes import Episode
 from hasm_torch.evaluation.compliance import BEHAVIOURS, Behaviour
 from hasm_torch.evaluation.grasp import GRASP_PATCH, REACH_PATCH, noisy_start
-from hasm_torch.lerobot.episodes import Episode
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.env import CONTROL_RATE, HSRTouchEnv
 from hasm_torch.sim.poses import GRASP_POSES, START_POSES

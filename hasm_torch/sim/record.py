@@ -10,7 +10,7 @@ from pathlib import Path
 import draccus
 from tqdm import tqdm
 
-from hasm_torch.lerobot import Episode, skin_patches, write_card, write_episodes
+from hasm_torch.data import Episode, skin_patches, write_card, write_episodes
 from hasm_torch.robot import JOINTS, Skin
 from hasm_torch.sim.demonstrator import (
     COMPLIANCE_FORCES,

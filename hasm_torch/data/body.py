@@ -1,0 +1,236 @@
+"""The body that a dataset describes: joint limits, and skin of any layout."""
+
+import math
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hasm_torch._assets import asset_path
+from hasm_torch.body import Body
+from hasm_torch.data.episodes import Episode, EpisodeSet, EpisodeStream
+from hasm_torch.data.skin import SkinPatch
+from hasm_torch.encoders.readings import DIRECTIONS, WRENCH
+from hasm_torch.robot.urdf import UrdfJoint, read_urdf
+
+Dataset = EpisodeSet | EpisodeStream
+
+# A position beyond its limits by more than this share of the range is worth a warning; by more
+# than FAR it is another unit or another joint.
+BEYOND, FAR = 0.01, 0.5
+# Faster than the speed limit by this factor: the frame rate is wrong.
+TOO_FAST = 2.0
+DEGREES = ("deg", "degree", "degrees", "°")
+
+
+class Limits(NamedTuple):
+    """Limits of every joint, in the dataset's units and order, and where they come from."""
+
+    lower: list[float]
+    upper: list[float]
+    max_speed: list[float]
+    source: str
+
+
+def body_of(data: Dataset, urdf: Path | None = None) -> Body:
+    """Joints and skin of a dataset.
+
+    Args:
+        data: The episodes; each is looked at once or twice.
+        urdf: The robot's URDF. Without it the limits are the bundled HSR's where that has all of
+            the dataset's joints, else the range of the data.
+
+    Returns:
+        The body, in the order of the dataset's vectors.
+
+    Raises:
+        ValueError: If the URDF lacks one of the joints, or the data cannot be in its units.
+    """
+    return _body(data, limits_of(data, urdf))
+
+
+def describe_body(data: Dataset, body: Body, urdf: Path | None = None) -> list[str]:
+    """Where limits and touch of ``body_of`` come from, a line each, for people."""
+    lines = [f"joint limits: {_limits_source(data, urdf)}"]
+    if not data.skin or not body.channels:
+        lines.append("no touch in this dataset: a plain sequence memory")
+    else:
+        kind = {1: "pressure", 3: "3 forces", 6: "wrench, a patch a direction"}[body.channels]
+        unit = next(iter(data.skin.values())).unit
+        sensors = body.readings // body.channels
+        lines.append(f"touch: {sensors} cells x {kind}, {len(body.patches)} patches, unit: {unit}")
+    return lines
+
+
+def limits_of(data: Dataset, urdf: Path | None = None) -> Limits:
+    """Joint limits of a dataset; arguments and errors as in ``body_of``."""
+    source = _limits_source(data, urdf)
+    chosen = urdf or (asset_path("hsr.urdf") if source != FROM_DATA else None)
+    if chosen is None:
+        lower, upper, speed = _range(data)
+        return Limits(*_widened(lower, upper, speed), source)
+    joints = _urdf_joints(data, chosen)
+    _check_units(data, joints, chosen)
+    lower = np.array([joint.lower for joint in joints])
+    upper = np.array([joint.upper for joint in joints])
+    speed = np.array([joint.velocity for joint in joints])
+    if not np.isfinite([lower, upper, speed]).all():
+        least, most, fastest = _widened(*_range(data))
+        lower = np.where(np.isfinite(lower), lower, least)
+        upper = np.where(np.isfinite(upper), upper, most)
+        speed = np.where(np.isfinite(speed), speed, fastest)
+    _check_positions(data, joints, lower, upper, chosen)
+    _check_speeds(data, joints, chosen)
+    return Limits(lower.tolist(), upper.tolist(), speed.tolist(), source)
+
+
+FROM_DATA = "the range of the data"
+
+
+def _limits_source(data: Dataset, urdf: Path | None) -> str:
+    if urdf is not None:
+        return str(urdf)
+    bundled = read_urdf(asset_path("hsr.urdf")).joints
+    return "the bundled hsr.urdf" if all(j in bundled for j in data.joints) else FROM_DATA
+
+
+def _urdf_joints(data: Dataset, urdf: Path) -> list[UrdfJoint]:
+    if not urdf.is_file():
+        raise FileNotFoundError(f"no URDF at {urdf}: check --robot.urdf")
+    joints = read_urdf(urdf).joints
+    missing = [name for name in data.joints if name not in joints]
+    if missing:
+        raise ValueError(
+            f"{urdf} has no joint {', '.join(missing)} of dataset {data.root}; its joints: "
+            f"{', '.join(joints)}. Name the dataset's joints as the URDF does, or leave the URDF "
+            "out: the limits are then the range of the data"
+        )
+    return [joints[name] for name in data.joints]
+
+
+def _check_units(data: Dataset, joints: Iterable[UrdfJoint], urdf: Path) -> None:
+    for joint, unit in zip(joints, data.units):
+        if joint.type == "revolute" and unit.lower() in DEGREES:
+            raise ValueError(
+                f"the state of {data.root} gives {joint.name} in degrees (unit {unit!r}), {urdf} "
+                "limits it in radians: convert the dataset to radians, or leave the URDF out so "
+                "that the limits are the range of the data"
+            )
+
+
+def _check_positions(
+    data: Dataset, joints: list[UrdfJoint], lower: np.ndarray, upper: np.ndarray, urdf: Path
+) -> None:
+    span = upper - lower
+    worst = np.full(len(joints), BEYOND)
+    found: dict[int, tuple[Episode, int]] = {}
+    for episode in data:
+        beyond = np.maximum(lower - episode.state, episode.state - upper) / span
+        frames = beyond.argmax(axis=0)
+        for j in np.flatnonzero(beyond.max(axis=0) > worst):
+            worst[j], found[int(j)] = beyond[frames[j], j], (episode, int(frames[j]))
+    for j, (episode, frame) in found.items():
+        value, joint = episode.state[frame, j], joints[j]
+        where = (
+            f"{joint.name} in the state of {data.root} reaches {value:.4g} at frame {frame} of "
+            f"episode {episode.index}, beyond its limits {lower[j]:.4g} to {upper[j]:.4g} in {urdf}"
+        )
+        if worst[j] > FAR:
+            degrees = joint.type == "revolute" and abs(value) > 2 * math.pi
+            raise ValueError(
+                f"{where}: "
+                + (
+                    "this looks like degrees; convert the dataset to radians"
+                    if degrees
+                    else "check the order of the joints and their units, or name another URDF"
+                )
+                + ", or leave the URDF out so that the limits are the range of the data"
+            )
+        warnings.warn(f"{where}; it is taken as the limit", stacklevel=4)
+
+
+def _check_speeds(data: Dataset, joints: list[UrdfJoint], urdf: Path) -> None:
+    limit = np.array([joint.velocity for joint in joints])
+    for episode in data:
+        if len(episode) < 2:
+            continue
+        # Not the fastest frames: a jump of a sensor is no matter of the rate.
+        speed = np.quantile(np.abs(np.diff(episode.state, axis=0)), 0.9, axis=0) * data.fps
+        fast = np.flatnonzero(speed > TOO_FAST * limit)
+        if fast.size:
+            j = int(fast[0])
+            warnings.warn(
+                f"{joints[j].name} in the state of {data.root} moves at {speed[j]:.3g} per second "
+                f"in episode {episode.index}, {urdf} allows {limit[j]:.3g}: check fps "
+                f"({data.fps:g}) in meta/info.json and the unit of the joint",
+                stacklevel=4,
+            )
+            return
+
+
+def _range(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least and greatest position and greatest speed of each joint, over states and targets."""
+    joints = len(data.joints)
+    lower, upper = np.full(joints, np.inf), np.full(joints, -np.inf)
+    speed = np.zeros(joints)
+    for episode in data:
+        for series in (episode.state, episode.action):
+            if series.shape[1] == joints:
+                lower = np.minimum(lower, series.min(axis=0))
+                upper = np.maximum(upper, series.max(axis=0))
+        if len(episode) > 1:
+            steps = np.abs(np.diff(episode.state.astype(np.float64), axis=0)).max(axis=0)
+            speed = np.maximum(speed, steps * data.fps)
+    if not np.isfinite(lower).all():
+        raise ValueError(f"dataset {data.root} has no episode to take joint limits from")
+    return lower.astype(np.float64), upper.astype(np.float64), speed
+
+
+def _widened(
+    lower: np.ndarray, upper: np.ndarray, speed: np.ndarray
+) -> tuple[list[float], list[float], list[float]]:
+    """A joint that stands still gets a little range and speed, for limits must differ."""
+    still = upper - lower <= 1e-6 * np.maximum(1.0, np.abs(upper))
+    room = np.where(still, 1e-3 * np.maximum(1.0, np.abs(upper)), 0.0)
+    slowest = (upper - lower + 2 * room) / 100.0
+    return (lower - room).tolist(), (upper + room).tolist(), np.maximum(speed, slowest).tolist()
+
+
+def _body(data: Dataset, limits: Limits) -> Body:
+    patches = list((data.skin or {}).values())
+    names, cells, directions, links = [], [], [], []
+    for patch in patches:
+        for name, count, direction in _split(patch):
+            names.append(name.replace(".", "_"))
+            cells.append(count)
+            directions.append(direction)
+            links.append(patch.link or "")
+    if not patches:
+        names, cells, directions, links = ["sequence"], [1], [[0.0, 0.0, 1.0]], [""]
+    return Body(
+        joints=list(data.joints),
+        lower=limits.lower,
+        upper=limits.upper,
+        max_speed=limits.max_speed,
+        patches=names,
+        cells=cells,
+        directions=directions,
+        links=links,
+        rate=float(data.fps),
+        channels=patches[0].channels if patches else 0,
+    )
+
+
+def _split(patch: SkinPatch) -> list[tuple[str, int, list[float]]]:
+    """Name, cells and direction of the patches that a patch of the dataset becomes."""
+    count = patch.cells.stop - patch.cells.start
+    if patch.channels == WRENCH:
+        sensors = [patch.name] if count == 1 else [f"{patch.name}_{i}" for i in range(count)]
+        return [(f"{s} {name}", 1, list(d)) for s in sensors for name, d in DIRECTIONS.items()]
+    if patch.normals is None:
+        return [(patch.name, count, [0.0, 0.0, 1.0])]
+    normal = np.asarray(patch.normals, dtype=np.float64).mean(axis=0)
+    length = float(np.linalg.norm(normal))
+    return [(patch.name, count, (normal / length).tolist() if length else [0.0, 0.0, 1.0])]

@@ -1,0 +1,1 @@
+"""From joint positions and skin forces to bipolar codes: one equation a file."""

@@ -1,0 +1,1 @@
+"""Compiled loops over arrays; each has a torch form that gives the same."""

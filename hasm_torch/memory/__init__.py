@@ -1,0 +1,1 @@
+"""The hetero-associative sequential memory: storing, binding and recall."""

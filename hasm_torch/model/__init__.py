@@ -1,0 +1,1 @@
+"""The whole model: fit, control, read-out and checkpoints."""
