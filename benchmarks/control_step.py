@@ -1,12 +1,10 @@
 """Time of one control step: skin and joints in, joint targets out.
 
-A model of the HSR's size (8 joints, 8 patches of 7 cells with 3 points each) holds a smooth walk
-of 5,000 states for one patch, and that patch is pressed all the time by a force that rises and
-falls. The robot takes up every target at once. The same rollout is run twice: once to count the
-recalls of every step, then for the time. Beside the time on the clock stands the time that the
-thread computed: on a busy machine the first one's tail is that of the other programs. The parts
-are timed on their own with the inputs of the control step; what is left is the bookkeeping between
-them.
+The default model of some bundled demonstrations is touched by a force that rises and falls, one
+taught patch after the other, and the robot takes up every target at once. Beside the time on the
+clock stands the time that the thread computed: on a busy machine the first one's tail is that of
+the other programs. The parts of a step with a recall are timed on their own; what is left is the
+bookkeeping between them.
 
     python -m benchmarks.control_step
 """
@@ -15,23 +13,25 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from benchmarks.machine import RESULTS, interleaved, print_machine, save_json
-from hasm_torch import HASM, Body, HASMConfig
+from hasm_torch import HASM, HASMConfig
 from hasm_torch.apps.command_line import parse_options
-from hasm_torch.config import MemoryShape
+from hasm_torch.data.body import body_of
+from hasm_torch.data.episodes import load_episodes
 from hasm_torch.encoders.readings import pressed
+from hasm_torch.model.control import Touched
+from hasm_torch.model.felt import PushDirection
+from hasm_torch.model.recalling import Recalling
+from hasm_torch.sim.tasks import TEST_FORCES
 
-JOINTS, PATCHES, CELLS = 8, 8, 7
-TOUCHED = "patch_0"
-
-# Force on the touched patch, N: between these, over so many control steps.
-FORCE_LOW, FORCE_HIGH, FORCE_PERIOD = 2.0, 8.0, 100
+FORCE_PERIOD = 100  # control steps in which the force rises and falls
+TOUCH_STEPS = 150  # control steps until another patch is touched and the robot starts again
 
 
 @dataclass
@@ -39,181 +39,145 @@ class Options:
     """Options of the command line.
 
     Attributes:
-        associations: Associations in the memory of the touched patch.
+        dataset: Demonstrations that the model learns, with spikes that lead it.
         steps: Control steps of the rollout.
         rounds: Timed rollouts.
         threads: CPU threads.
         output_dir: Where the result goes.
     """
 
-    associations: int = 5000
+    dataset: Path = Path("datasets/hsr_yield")
     steps: int = 2000
     rounds: int = 3
     threads: int = 1
     output_dir: str = str(RESULTS)
 
 
-def build_model(associations: int) -> HASM:
-    """A model whose touched patch holds a closed smooth walk through all joints.
-
-    Args:
-        associations: States of the walk. A link takes the spikes of one control step under a
-            medium force, as in an episode recorded at the control rate.
-    """
-    body = Body(
-        joints=[f"joint_{i}" for i in range(JOINTS)],
-        lower=[-1.5] * JOINTS,
-        upper=[1.5] * JOINTS,
-        max_speed=[2.0] * JOINTS,
-        patches=[f"patch_{i}" for i in range(PATCHES)],
-        cells=[CELLS] * PATCHES,
-        directions=[[math.cos(i), math.sin(i), 0.0] for i in range(PATCHES)],
-    )
-    model = HASM(HASMConfig(), body)
-    memory = model.add_memory(TOUCHED, MemoryShape(list(range(JOINTS)), associations, 1))
-    memory.touch_levels.fill_(0.4)
-    turn = torch.arange(associations + 1) / associations * 2 * math.pi
-    phase = torch.arange(JOINTS).float()
-    walk = 1.3 * torch.sin((1 + torch.arange(JOINTS) % 3) * turn.unsqueeze(1) + phase)
-    way = (walk.diff(dim=0).abs() / 3.0).amax(-1)
-    counts, _, _ = model.skin(pressed(body, TOUCHED, 5.0).expand(50, -1, -1))
-    pace = counts[:, 0].mean() / way
-    memory.write(walk[:-1], torch.full((associations,), 0.4), walk[1:], pace)
-    memory.memory.beta.fill_(memory.memory.crowding().beta)
-    model.reset()
-    return model
+def learn(dataset: Path) -> tuple[HASM, torch.Tensor]:
+    """The default model of a dataset, and the (joints,) state in which its first episode begins."""
+    data = load_episodes(dataset)
+    model = HASM(HASMConfig(), body_of(data))
+    model.fit(data)
+    return model, torch.from_numpy(data.episodes[0].state[0])
 
 
-def start_position(model: HASM) -> Tensor:
-    """Joint positions that the touched patch's memory knows."""
-    return model.memory(TOUCHED).memory.successors[0, :JOINTS].clone()
-
-
-def roll_out(model: HASM, steps: int) -> np.ndarray:
+def roll_out(model: HASM, start: torch.Tensor, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Run a rollout.
 
     Args:
-        model: From ``build_model``.
+        model: From ``learn``.
+        start: (joints,) where the robot starts.
         steps: Control steps.
 
     Returns:
-        (2, steps) seconds of each step, on the clock and computed by this thread.
+        (2, steps) seconds of each step, on the clock and computed by this thread; (steps,) recalls.
     """
-    model.reset()
-    state = start_position(model)
-    seconds = np.empty((2, steps))
+    low, high = TEST_FORCES
+    seen = torch.zeros(sum(model.body.observations.values()))
+    seconds, recalls = np.empty((2, steps)), np.zeros(steps, dtype=np.int64)
     for step in range(steps):
+        if step % TOUCH_STEPS == 0:
+            model.reset()
+            state, patch = start, model.patches[step // TOUCH_STEPS % len(model.patches)]
         wave = 0.5 - 0.5 * math.cos(2 * math.pi * step / FORCE_PERIOD)
-        skin = pressed(model.body, TOUCHED, FORCE_LOW + (FORCE_HIGH - FORCE_LOW) * wave)
+        skin = pressed(model.body, patch, low + (high - low) * wave)
         clock, computed = time.perf_counter(), time.thread_time()
-        state = model.step(state, skin)
+        state = model.step(state, skin, observation=seen)
         computed_after = time.thread_time()
         seconds[:, step] = time.perf_counter() - clock, computed_after - computed
-    return seconds
+        recalls[step] = len(model.rollout.queries)
+    return seconds, recalls
 
 
-def count_recalls(model: HASM, steps: int) -> np.ndarray:
-    """Count the recalls in every step of the rollout.
-
-    Args:
-        model: From ``build_model``.
-        steps: Control steps.
-
-    Returns:
-        (steps,) recalls.
-
-    Raises:
-        RuntimeError: If there was none.
-    """
-    recalls = np.zeros(steps, dtype=np.int64)
-    counted, step = 0, 0
-
-    def count(*_: Any) -> None:
-        nonlocal counted
-        counted += 1
-
-    memory_hook = model.memory(TOUCHED).memory.register_forward_hook(count)
-    inner = model.step
-
-    def counting(state: Tensor, skin: Tensor) -> Tensor:
-        nonlocal counted, step
-        target = inner(state, skin)
-        recalls[step], counted, step = counted, 0, step + 1
-        return target
-
-    model.step = counting  # type: ignore[method-assign, assignment]
-    roll_out(model, steps)
-    del model.step  # the instance's, which hid the class's
-    memory_hook.remove()
-    if not recalls.any():
-        raise RuntimeError("no step recalled anything, so this rollout measures no recall")
-    return recalls
-
-
-def parts(model: HASM, rounds: int) -> dict[str, np.ndarray]:
-    """Time the parts of a step with its inputs.
+def parts(model: HASM, start: torch.Tensor, rounds: int) -> dict[str, np.ndarray]:
+    """Time the parts of a step.
 
     Args:
-        model: In the middle of a rollout.
+        model: From ``learn``, of displacements.
+        start: (joints,) where the robot stands.
         rounds: Timings of each part.
 
     Returns:
         For each part (rounds,) seconds.
     """
-    skin, memory = model.skin, model.memory(TOUCHED)
-    sample = pressed(model.body, TOUCHED, 5.0).unsqueeze(0)
-    _, force, state = skin(sample, model.rollout.skin)
-    drive = skin.current_per_newton * force[0].unsqueeze(-1).expand(-1, skin.steps).contiguous()
-    reference, density = model.reference, model.density[0]
-    codes = memory.codes(reference, density)
+    assert model.skin is not None
+    recalling, skin = model.recalling, model.skin
+    assert isinstance(recalling, Recalling)
+    patch = model.body.patches.index(model.patches[0])
+    positions = start.double().numpy()
+    forces = pressed(model.body, model.patches[0], 6.0).numpy()[None, None]
+    state = skin.start()
+    push = skin.encode(forces, state)[1][0, 0, :, 1:]
+    to_base = PushDirection(model.body, model.config.frame)
+    direction = to_base.of_patch(patch, push[patch], positions)
+    touch = Touched(patch, 3.0, 0.4, direction, np.zeros(sum(model.body.observations.values())))
+    query = recalling.query(positions, touch)
     calls: dict[str, Callable[[], Any]] = {
-        "skin and spikes": lambda: skin(sample, state),
-        "of which spikes": lambda: skin.neuron(drive, state.neurons),
-        "codes of a query": lambda: memory.codes(reference, density),
-        "binding and recall": lambda: memory.memory(*codes),
+        "skin and spikes": lambda: skin.encode(forces, state),
+        "direction of the force": lambda: to_base.of_patch(patch, push[patch], positions),
+        "codes of a query": lambda: recalling.query(positions, touch),
+        "recall and read-out": lambda: recalling.recall(query, touch),
     }
     return interleaved(calls, rounds)
+
+
+@torch.no_grad()
+def measure(options: Options) -> dict[str, Any]:
+    """Learn and time.
+
+    Returns:
+        Sizes, recalls and, under ``ms``, median and 99th percentile by what was timed.
+
+    Raises:
+        RuntimeError: If nothing was recalled.
+    """
+    model, start = learn(options.dataset)
+    runs = [roll_out(model, start, options.steps) for _ in range(options.rounds)]
+    seconds, computed = np.hstack([run[0] for run in runs])
+    recalls = np.concatenate([run[1] for run in runs])
+    if not recalls.any():
+        raise RuntimeError("no step recalled anything, so this rollout measures no recall")
+    samples = {
+        "control step": seconds,
+        "with a recall": seconds[recalls > 0],
+        "without": seconds[recalls == 0],
+        "computed: control step": computed,
+        "computed: with a recall": computed[recalls > 0],
+    }
+    for name, values in parts(model, start, 500 * options.rounds).items():
+        samples[f"part: {name}"] = values
+    assert isinstance(model.recalling, Recalling)
+    return {
+        "dataset": str(options.dataset),
+        "associations": len(model.origins),
+        "steps": len(seconds),
+        "code_dim": model.recalling.code.code_dim,
+        "share_with_recall": float((recalls > 0).mean()),
+        "mean_recalls": float(recalls.mean()),
+        "ms": {
+            name: {
+                "median": float(1e3 * np.median(values)),
+                "p99": float(1e3 * np.quantile(values, 0.99)),
+            }
+            for name, values in samples.items()
+            if len(values)
+        },
+    }
 
 
 def main() -> None:
     """Measure, print the table and write the result."""
     options = parse_options(Options)
     torch.set_num_threads(options.threads)
-    torch.set_grad_enabled(False)
     print_machine()
-    model = build_model(options.associations)
-    recalls = count_recalls(model, options.steps)
-    seconds, computed = np.hstack([roll_out(model, options.steps) for _ in range(options.rounds)])
-    recalls = np.tile(recalls, options.rounds)
-    part_seconds = parts(model, 500 * options.rounds)
-
-    result: dict[str, Any] = {
-        "associations": options.associations,
-        "steps": len(seconds),
-        "code_dim": model.memory(TOUCHED).memory.code_dim,
-        "share_with_recall": float((recalls > 0).mean()),
-        "mean_recalls": float(recalls.mean()),
-        "ms": {},
-    }
+    result = measure(options)
     print(
-        f"{len(seconds)} steps, {options.associations} associations x {result['code_dim']} bits, "
-        f"{result['share_with_recall']:.0%} of the steps with a recall, "
-        f"{result['mean_recalls']:.2f} recalls a step"
+        f"{result['steps']} steps, {result['associations']} associations x {result['code_dim']} "
+        f"entries, {result['share_with_recall']:.0%} of the steps with a recall"
     )
-    print(f"{'':26} {'median':>8} {'p99':>8}  ms")
-    samples = {
-        "control step": seconds,
-        "  with a recall": seconds[recalls > 0],
-        "  without": seconds[recalls == 0],
-        "computed: control step": computed,
-        "computed: with a recall": computed[recalls > 0],
-        **{f"part: {name}": values for name, values in part_seconds.items()},
-    }
-    for name, values in samples.items():
-        if len(values):
-            median, tail = 1e3 * np.median(values), 1e3 * np.quantile(values, 0.99)
-            print(f"{name:26} {median:8.3f} {tail:8.3f}")
-            result["ms"][name.strip()] = {"median": float(median), "p99": float(tail)}
+    print(f"{'':34} {'median':>8} {'p99':>8}  ms")
+    for name, ms in result["ms"].items():
+        print(f"{name:34} {ms['median']:8.3f} {ms['p99']:8.3f}")
     print(save_json(options.output_dir, "control_step", result))
 
 

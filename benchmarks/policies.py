@@ -1,64 +1,39 @@
-"""Our policy beside its own variants and what others would use, on the same episodes and rollouts.
+"""The memory beside its own variants and what others would use, on the same episodes and rollouts.
 
-First the table: every contestant in both experiments of ``eval.py``, which computes the figures.
-Then curves: how far a few of them generalise, what faults of the skin and few demonstrations do to
-them, and what unrelated motions in the same memories do to the default. Rollouts are seeded, so
-that all contestants meet the same forces, postures, objects and faults. A compliance rollout
-succeeds if the right joint went the right way by 0.02 rad and no other joint gave way by 0.005 rad
-or m; a grasp if the object is lifted and held at the end; a touch between two patches if the motion
-is within 20 degrees of the sum of both behaviours' motions. Finished cells are kept one JSON line
-each, and a run that was stopped goes on behind them.
+Every contestant learns all bundled demonstrations of each experiment and is rolled out as
+``eval.py`` rolls out a checkpoint, which computes the figures: the same forces, postures, objects
+and faults for everyone. The skin may be damaged and filtered, for all alike.
 
-    uv run benchmarks/policies.py               # about an hour on two cores
-    uv run benchmarks/policies.py --quick=true  # three minutes, too few rollouts to conclude from
+    uv run benchmarks/policies.py               # most of it trains two networks for each experiment
+    uv run benchmarks/policies.py --quick=true  # minutes, too few rollouts to conclude from
 """
 
-import json
-import math
-import multiprocessing
-import os
-import time
-from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
 import torch
 from tqdm import tqdm
 
-from benchmarks.baselines.contestants import CONTESTANTS, LEARNED, TUNED_NEIGHBOURS
+from benchmarks.baselines.contestants import CONTESTANTS, loader, save, step_ms, train
+from benchmarks.baselines.faults import Fault, Kind
 from benchmarks.baselines.learned_training import Training
 from benchmarks.machine import RESULTS, print_machine, save_json
-from benchmarks.policies_bench import Bench, Cell
-from benchmarks.policies_figures import draw_all
-from benchmarks.policies_report import curve_table, goal_table, goals, pool, table
 from hasm_torch.apps.command_line import parse_options
+from hasm_torch.data.body import body_of
+from hasm_torch.data.episodes import load_episodes
+from hasm_torch.data.training import warm_up
+from hasm_torch.encoders.readings import pressed
+from hasm_torch.evaluation import suite
+from hasm_torch.evaluation.options import EvalConfig
+from hasm_torch.evaluation.runner import EXPERIMENTS, Runner, check_experiments
+from hasm_torch.sim.tasks import WRIST_PATCHES
 
-COMPARED = ("default", TUNED_NEIGHBOURS)
-# Levels of every condition. Compliance and grasps are rolled out where both have a meaning.
-BOTH: dict[str, tuple[float, ...]] = {
-    "force": (3.0, 8.0, 12.0),  # N, on every touch
-    "dead": (0.1, 0.3, 0.5),  # share of the cells
-    "noise": (0.1, 0.5, 2.0),  # N a point
-    "lost": (0.1, 0.3, 0.5),  # share of the samples
-    "offset": (0.2, 0.5),  # N a point
-    "stuck": (0.5, 1.0),  # N a point
-}
-COMPLIANCE_ONLY = {
-    "posture": (0.0, 0.5, 1.0),  # way to any other posture
-    "between": (0.0,),
-}
-GRASP_ONLY = {
-    "start_noise": (0.1, 0.2, 0.3),  # rad
-    "object": (0.02, 0.04),  # m
-}
-DEMONSTRATIONS = (1.0, 2.0, 5.0, 10.0)  # episodes a behaviour
-CROWDS = (0.0, 10.0, 100.0, 1000.0, 10_000.0)  # unrelated motions in each memory
-QUICK_SECONDS = 2.0  # of a network's training
-# Conditions of ``--quick``, each at one level.
-QUICK = {"dead": 0.3, "noise": 0.5, "posture": 1.0, "between": 0.0, "start_noise": 0.3}
+QUICK_ROLLOUTS, QUICK_SECONDS = 1, 2.0
+TIMED_FORCE, TIMED_STEPS = 8.0, 300  # N; control steps
+BULKY = ("velocities", "results", "kinds")  # of the figures, that nobody compares
 
 
 @dataclass
@@ -66,30 +41,28 @@ class Options:
     """Options of the command line.
 
     Attributes:
-        contestants: Who is in the table; everyone by default.
-        curves: Whether the curves are run.
-        rollouts: Evenly pressed rollouts a behaviour for the table; grasps are twice as many.
-            A point of a curve takes half of both from each seed.
-        seeds: Seeds of the curves.
-        seed: First seed.
-        train_seconds: Longest training of a network for the table, s of one core; half as long
-            for a point of a curve.
-        quick: One rollout, one seed, few conditions, networks hardly trained; in another folder.
-        minutes: Start nothing new after so long; the next run goes on.
-        workers: Processes, each with one thread.
+        contestants: Who is rolled out; everyone by default.
+        experiments: Of "compliance", "yield" and "grasp".
+        rollouts: Rollouts of each group, see ``eval.py``; by default those of ``eval.py``.
+        seed: Seed of everything that the tests draw.
+        train_seconds: Longest training of a network, s of one core.
+        fault: What is wrong with the skin, if anything; see ``benchmarks.baselines.faults``.
+        level: How much of it.
+        filter: Whether the skin filter stands before every policy.
+        quick: Few rollouts, networks hardly trained; in another folder.
         datasets: Folder of the bundled datasets.
-        output_dir: Where the results go.
+        output_dir: Where ``policies.json`` goes.
     """
 
     contestants: list[str] = field(default_factory=lambda: list(CONTESTANTS))
-    curves: bool = True
-    rollouts: int = 4
-    seeds: int = 3
+    experiments: list[str] = field(default_factory=lambda: list(EXPERIMENTS))
+    rollouts: int | None = None
     seed: int = 0
     train_seconds: float = 120.0
+    fault: Literal["none"] | Kind = "none"
+    level: float = 0.0
+    filter: bool = False
     quick: bool = False
-    minutes: float | None = None
-    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     datasets: Path = Path("datasets")
     output_dir: Path | None = None
 
@@ -97,145 +70,131 @@ class Options:
         unknown = [name for name in self.contestants if name not in CONTESTANTS]
         if unknown:
             raise ValueError(f"unknown contestants {unknown}, valid: {', '.join(CONTESTANTS)}")
+        check_experiments(self.experiments)
+        self.damage()
         if self.quick:
-            self.rollouts, self.seeds, self.train_seconds = 1, 1, QUICK_SECONDS
-        if min(self.rollouts, self.seeds, self.workers) < 1:
-            raise ValueError(
-                "rollouts, seeds and workers must be at least 1, got "
-                f"{self.rollouts}, {self.seeds} and {self.workers}"
-            )
+            self.rollouts, self.train_seconds = QUICK_ROLLOUTS, QUICK_SECONDS
         if self.output_dir is None:
             self.output_dir = Path("outputs/benchmarks/policies") if self.quick else RESULTS
 
-
-def cells(options: Options) -> list[Cell]:
-    """All cells: the table's, the curves', and behind them what trains networks."""
-    return sorted(_cells(options), key=lambda cell: cell.contestant in LEARNED)
-
-
-def _cells(options: Options) -> Iterator[Cell]:
-    most = 1 if options.quick else 2 * options.rollouts
-    for name in options.contestants:
-        yield Cell(name, "none", 0.0, options.seed, options.rollouts, most)
-    if not options.curves:
-        return
-    few, grasps = math.ceil(options.rollouts / 2), options.rollouts
-    for seed in range(options.seed, options.seed + options.seeds):
-        for name in COMPARED:
-            yield Cell(name, "unharmed", 0.0, seed, few, grasps)
-        for condition, levels in {**BOTH, **COMPLIANCE_ONLY, **GRASP_ONLY}.items():
-            if options.quick:
-                levels = (QUICK[condition],) if condition in QUICK else ()
-            pushes = 0 if condition in GRASP_ONLY else few
-            lifts = 0 if condition in COMPLIANCE_ONLY else grasps
-            for level in levels:
-                for name in COMPARED:
-                    yield Cell(name, condition, level, seed, pushes, lifts)
-        for level in DEMONSTRATIONS[:1] if options.quick else DEMONSTRATIONS:
-            for name in (*COMPARED, *LEARNED):
-                yield Cell(name, "demonstrations", level, seed, few, grasps)
-        for level in CROWDS[1:2] if options.quick else CROWDS:
-            yield Cell("default", "crowding", level, seed, 0, grasps)
+    def damage(self) -> Fault | None:
+        """What is wrong with the skin."""
+        return None if self.fault == "none" else Fault(self.fault, self.level)
 
 
-def finished(path: Path) -> dict[str, dict[str, Any]]:
-    """Results of an earlier run, by the key of their cell; a line that was cut off is left out."""
-    results = {}
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            entry = json.loads(line)
-            results[entry["key"]] = entry
-        except (json.JSONDecodeError, KeyError):
-            continue
+def run(options: Options) -> dict[str, Any]:
+    """Train and roll out every contestant.
+
+    Returns:
+        Figures by contestant: those of each experiment as in ``metrics.json``, and ``costs``.
+    """
+    warm_up()
+    config = EvalConfig(  # a checkpoint is one that nobody knows the teaching of
+        checkpoint=Path(),
+        experiments=options.experiments,
+        rollouts=options.rollouts,
+        seed=options.seed,
+    )
+    groups = suite.plan(config)
+    results: dict[str, dict[str, Any]] = {}
+    with TemporaryDirectory() as scratch:
+        for name in options.contestants:
+            results[name] = {"costs": {}}
+        for experiment in tqdm(options.experiments, desc="training", unit="experiment"):
+            for name in options.contestants:
+                directory = _directory(scratch, name, experiment)
+                results[name]["costs"][experiment] = _train(options, name, experiment, directory)
+        with closing(Runner(loader(options.damage(), options.filter))) as runner:
+            led = {g.name: runner.start(g.experiment, g.cases, None) for g in groups if g.taught}
+            rolled = {
+                name: led
+                | {
+                    g.name: runner.start(
+                        g.experiment, g.cases, _directory(scratch, name, g.experiment)
+                    )
+                    for g in groups
+                    if not g.taught
+                }
+                for name in options.contestants
+            }
+            for name, started in rolled.items():
+                found = {group: [f.result()[1] for f in fs] for group, fs in started.items()}
+                results[name] |= _without(suite.summarise(config, groups, found))
     return results
 
 
-def main() -> None:
-    """Run what is not finished, print the tables, write JSON and figures."""
-    options = parse_options(Options)
-    print_machine()
-    print(*run(options), sep="\n")
+def _directory(scratch: str, name: str, experiment: str) -> Path:
+    return Path(scratch) / experiment / name.replace(" ", "_")
 
 
-def run(options: Options) -> list[Path]:
-    """Run the cells that are not finished and report all; see ``main``.
-
-    Returns:
-        The files written.
-    """
-    assert options.output_dir is not None
-    options.output_dir.mkdir(parents=True, exist_ok=True)
-    log = options.output_dir / "policies.jsonl"
-    planned, results = cells(options), finished(log)
-    waiting = [cell for cell in planned if cell.key not in results]
-    if results:  # without a line that was cut off
-        log.write_text("".join(json.dumps(entry) + "\n" for entry in results.values()))
-    with log.open("a") as lines, tqdm(total=len(waiting), desc="cells", unit="cell") as bar:
-        for cell, figures in _run_all(waiting, options):
-            results[cell.key] = {"key": cell.key, **vars(cell), "results": figures}
-            lines.write(json.dumps(results[cell.key]) + "\n")
-            lines.flush()
-            bar.set_postfix_str(f"{cell.contestant}, {cell.condition} {cell.level:g}")
-            bar.update()
-    done = [results[cell.key] for cell in planned if cell.key in results]
-    ranked = [entry for entry in done if entry["condition"] == "none"]
-    curves = pool([entry for entry in done if entry["condition"] != "none"])
-    reached = goals(ranked, curves)
-    print(table(ranked), curve_table(curves), goal_table(reached), sep="\n\n")
-    content = {
-        "version": version("hasm-torch"),
-        "seed": options.seed,
-        "workers": options.workers,
-        "train_seconds": options.train_seconds,
-        "cells": {"planned": len(planned), "finished": len(done)},
-        "goals": reached,
-        "contestants": [{k: v for k, v in entry.items() if k != "key"} for entry in ranked],
-        "curves": curves,
-    }
-    paths = [save_json(options.output_dir, "policies", content)]
-    return paths + draw_all(ranked, curves, options.output_dir)
-
-
-def _run_all(waiting: list[Cell], options: Options) -> Iterator[tuple[Cell, dict[str, Any]]]:
-    """Results of the cells as they come, from as many processes as there may be."""
-    begin = time.perf_counter()
+def _train(options: Options, name: str, experiment: str, directory: Path) -> dict[str, Any]:
+    """Train a contestant and write it; what it cost."""
+    data = load_episodes(options.datasets / f"hsr_{experiment}")
+    body = body_of(data)
     training = Training(seconds=options.train_seconds)
-
-    def in_time() -> bool:
-        return not options.minutes or time.perf_counter() - begin < 60 * options.minutes
-
-    if options.workers == 1:
-        bench = Bench(options.datasets, training)
-        for cell in waiting:
-            if in_time():
-                yield cell, bench.run(cell)
-        bench.close()
-        return
-    queue, running = list(waiting), dict[Future[dict[str, Any]], Cell]()
-    with ProcessPoolExecutor(
-        options.workers,
-        mp_context=multiprocessing.get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(options.datasets, training),
-    ) as workers:
-        while running or (queue and in_time()):
-            while queue and len(running) < options.workers and in_time():
-                cell = queue.pop(0)
-                running[workers.submit(_run_in_worker, cell)] = cell
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                yield running.pop(future), future.result()
+    trained = train(name, experiment, body, data.episodes, training)
+    save(trained.policy, body, data.episodes, directory)
+    touch = pressed(body, WRIST_PATCHES[0], TIMED_FORCE)
+    return {
+        "train_seconds": trained.seconds,
+        "memory_bytes": trained.policy.memory_bytes(),
+        "step_ms": step_ms(trained.policy, body, touch, TIMED_STEPS),
+        "notes": trained.notes,
+    }
 
 
-_worker: dict[str, Bench] = {}
+def _without(figures: dict[str, Any]) -> dict[str, Any]:
+    """Figures less what is bulky."""
+    return {
+        key: _without(value) if isinstance(value, dict) else value
+        for key, value in figures.items()
+        if key not in BULKY
+    }
 
 
-def _start_worker(datasets: Path, training: Training) -> None:
+def table(results: dict[str, Any]) -> str:
+    """One line a contestant; of the behaviours' figures the worst, costs added or the largest."""
+    header = [
+        "contestant", "arm with force", "wrist turns", "spearman", "yields", "against", "base",
+        "grasps", "train s", "kB", "step ms",
+    ]  # fmt: skip
+    rows = [header]
+    for name, found in results.items():
+        behaviours = found.get("compliance", {}).get("behaviours", {}).values()
+        costs = found["costs"].values()
+        cells = [
+            found.get("compliance", {}).get("with_force"),
+            found.get("compliance", {}).get("correct_turn"),
+            min((b["spearman"] for b in behaviours), default=None),
+            found.get("yield", {}).get("along_force", {}).get("share_07_of_teacher"),
+            found.get("yield", {}).get("along_force", {}).get("against"),
+            found.get("yield", {}).get("torso", {}).get("base_cos_09"),
+            found.get("grasp", {}).get("success_rate"),
+            sum(cost["train_seconds"] for cost in costs),
+            sum(cost["memory_bytes"] for cost in costs) / 1e3,
+            max(cost["step_ms"] for cost in costs),
+        ]
+        shown = ["" if x is None else f"{x:,.0f}" if x >= 100 else f"{x:.2f}" for x in cells]
+        rows.append([name, *shown])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
+    lines = ["  ".join(f"{c:>{w}}" if i else f"{c:<{w}}"
+                       for i, (c, w) in enumerate(zip(row, widths))) for row in rows]  # fmt: skip
+    return "\n".join((lines[0], "-" * len(lines[0]), *lines[1:]))
+
+
+def main() -> None:
+    """Train, roll out, print a table, write JSON."""
+    options = parse_options(Options)
+    assert options.output_dir is not None
     torch.set_num_threads(1)
-    _worker["bench"] = Bench(datasets, training)
-
-
-def _run_in_worker(cell: Cell) -> dict[str, Any]:
-    return _worker["bench"].run(cell)
+    print_machine()
+    results = run(options)
+    print(table(results))
+    asked = {
+        name: getattr(options, name)
+        for name in ("rollouts", "seed", "train_seconds", "fault", "level", "filter")
+    }
+    print(save_json(options.output_dir, "policies", {"options": asked, "contestants": results}))
 
 
 if __name__ == "__main__":

@@ -1,22 +1,40 @@
-"""Write the README's result tables from evaluations, so that no number is typed by hand.
+"""Write the result tables of README.md and docs/ from results, so that no number is typed by hand.
 
-uv run eval.py --render=false --output_dir=outputs/eval/default
-uv run eval.py --render=false --method=literal --output_dir=outputs/eval/literal
-uv run benchmarks/policies.py
-uv run python -m benchmarks.readme_tables
+A table stands between <!-- table:NAME --> and <!-- /table:NAME --> in any of these pages; what it
+is made of lies in benchmarks/results/:
+
+    uv run eval.py --render=false --output_dir=outputs/eval/default
+    uv run eval.py --render=false --method=literal --output_dir=outputs/eval/literal
+    cp outputs/eval/default/metrics.json benchmarks/results/eval_default.json
+    cp outputs/eval/literal/metrics.json benchmarks/results/eval_literal.json
+    uv run eval.py --mode=open_loop --dataset.root=FOLDER  # open_loop.json → open_loop_icub.json
+    uv run benchmarks/yield_controls.py                    # → yield_controls.json
+    uv run benchmarks/rules.py                             # → rules.json
+    uv run benchmarks/readme_tables.py
 """
 
 import json
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import draccus
-
 from benchmarks.machine import RESULTS
-from benchmarks.policies_report import goal_table
-from hasm_torch.evaluation.report import COMPLIANCE_FIGURES, GRASP_FIGURES, table
+from hasm_torch.apps.command_line import parse_options
+from hasm_torch.evaluation.report import (
+    COMPLIANCE_FIGURES,
+    GRASP_FIGURES,
+    GRASP_MOVED,
+    YIELD_SHARES,
+    table,
+)
+
+MARKED = re.compile(r"(<!-- table:(\w+) -->\n)(.*?)(<!-- /table:\2 -->)", re.DOTALL)
+OPEN_LOOP = {"hasm": "memory", "neighbours": "tuned neighbours", "ridge": "ridge on lags"}
+ROBOTS = {"open_loop_icub": "iCub"}
+
+Rows = Sequence[Sequence[str]]
 
 
 @dataclass
@@ -24,114 +42,154 @@ class Options:
     """Options of the command line.
 
     Attributes:
-        default: Evaluation of the default method.
-        literal: Evaluation of the paper as written.
-        policies: What ``benchmarks/policies.py`` wrote.
-        readme: File whose tables are replaced.
+        results: Folder of the results.
+        root: Folder of README.md and docs/.
     """
 
-    default: Path = Path("outputs/eval/default")
-    literal: Path = Path("outputs/eval/literal")
-    policies: Path = RESULTS / "policies.json"
-    readme: Path = Path("README.md")
+    results: Path = RESULTS
+    root: Path = Path()
 
 
-# Contestants of the README's table; the full one is what the benchmark prints.
-SHOWN = (
-    "default",
-    "the paper literally",
-    "without spikes",
-    "every sample stored",
-    "touch in the base frame",
-    "real-valued codes",
-    "binary, 4 bits",
-    "gray, 8 bits",
-    "one shared memory",
-    "one shared memory without RoPE3D",
-    "standing still",
-    "nearest neighbours",
-    "nearest neighbours, tuned",
-    "dense associative memory",
-    "ACT",
-    "Diffusion",
-)
+def markdown(header: Sequence[str], rows: Rows) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def contestants(entries: list[dict[str, Any]]) -> str:
-    """A Markdown table of contestants; costs are those of both experiments together."""
-    lines = [
-        "| contestant | compliance | grasp | force order | training | kept | control step |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    found = {entry["contestant"]: entry["results"] for entry in entries}
-    for name in SHOWN:
-        if name not in found:
-            continue
-        both = yielding, grasping = found[name]["compliance"], found[name]["grasp"]
-        order = min(b["spearman"] for b in yielding["behaviours"].values())
-        cells = [
-            name,
-            *(f"{result['successes']}/{result['rollouts']}" for result in both),
-            f"{order:.2f}",
-            f"{sum(result['train_seconds'] for result in both):.1f} s",
-            f"{sum(result['memory_bytes'] for result in both) / 1e3:,.0f} kB",
-            f"{max(yielding['step_ms'], grasping['step_ms']):.2f} ms",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+def default(evaluated: dict[str, Any]) -> str:
+    """What an evaluation prints."""
+    return "```\n" + re.sub(r" +$", "", table(evaluated), flags=re.MULTILINE) + "\n```"
 
 
-def comparison(default: dict[str, Any], literal: dict[str, Any]) -> str:
-    """A Markdown table of both; of the four behaviours each figure's worst."""
-    lines = ["| figure | must reach | default | literal |", "|---|---|---|---|"]
+def literal(*both: dict[str, Any]) -> str:
+    """Figures of the default and of the paper as written; of behaviours each figure's worst."""
+    rows = []
     for key, goal, more in COMPLIANCE_FIGURES:
-        worst = [
-            (min if more else max)(b[key] for b in m["compliance"]["behaviours"].values())
-            for m in (default, literal)
-        ]
-        lines.append(_row(f"compliance, worst of 4: `{key}`", goal, more, worst))
+        behaviours = [m["compliance"]["behaviours"].values() for m in both]
+        worst = [(min if more else max)(b[key] for b in found if key in b) for found in behaviours]
+        rows.append(_row(f"compliance, the worst: `{key}`", goal, more, worst))
+    for size, goal in YIELD_SHARES.items():
+        key = "share_07_of_teacher"
+        shares = [m["yield"]["episodes"][size][key] for m in both]
+        rows.append(_row(f"yield, {size} episodes: `{key}`", goal, True, shares))
     for key, goal, more in GRASP_FIGURES:
-        lines.append(
-            _row(f"grasp: `{key}`", goal, more, [m["grasp"][key] for m in (default, literal)])
-        )
-    violations = [
-        m["compliance"]["limit_violations"] + m["grasp"]["limit_violations"]
-        for m in (default, literal)
+        rows.append(_row(f"grasp: `{key}`", goal, more, [m["grasp"][key] for m in both]))
+    for reach, goal in GRASP_MOVED.items():
+        moved = [m["grasp"]["moved"][reach] for m in both]
+        rows.append(_row(f"grasp, moved by up to {reach} m", goal, True, moved))
+    parts = [(m["compliance"], m["yield"], m["yield"]["torso"], m["grasp"]) for m in both]
+    violations = [sum(part["limit_violations"] for part in mine) for mine in parts]
+    rows.append(_row("`limit_violations`", 0, False, violations))
+    rows.append(_row("`train_seconds`", 5, False, [m["train_seconds"] for m in both]))
+    rows.append(_row("`memory_bytes`", 1_000_000, False, [m["memory_bytes"] for m in both]))
+    ticks = [m["tick_ms"]["median"] for m in both]
+    rows.append(_row("`tick_ms`, median", 0.35, False, ticks))
+    return markdown(("figure", "must reach", "default", "literal"), rows)
+
+
+def yielding(evaluated: dict[str, Any]) -> str:
+    """Yielding by number of demonstrations."""
+    keys = ("share_07_of_teacher", "cos_median", "against", "travel_of_teacher")
+    rows = [
+        [size, *(_shown(figures[key]) for key in keys)]
+        for size, figures in evaluated["yield"]["episodes"].items()
     ]
-    lines.append(_row("`limit_violations`", 0, False, violations))
-    for key, goal in (("train_seconds", 5), ("memory_bytes", 1_000_000)):
-        lines.append(_row(f"`{key}`", goal, False, [m[key] for m in (default, literal)]))
-    ticks = [m["tick_ms"]["median"] for m in (default, literal)]
-    lines.append(_row("`tick_ms`, median", 1, False, ticks))
-    return "\n".join(lines)
+    return markdown(("episodes", *(f"`{key}`" for key in keys)), rows)
 
 
-def _row(name: str, goal: float, more: bool, values: list[float]) -> str:
-    shown = [f"{v:,}" if isinstance(v, int) else f"{v:.3g}" for v in values]
-    return f"| {name} | {'≥' if more else '≤'} {goal:,} | {' | '.join(shown)} |"
+def open_loop(*reports: dict[str, Any]) -> str:
+    """Errors of open-loop prediction, relative to standing still."""
+    rows = [
+        [robot, f"{part['seconds_ahead']:.2g} s", *(_shown(part[who]) for who in OPEN_LOOP)]
+        for robot, report in zip(ROBOTS.values(), reports)
+        for part in (report["one_step"], report["horizon"])
+    ]
+    return markdown(("robot", "ahead", *OPEN_LOOP.values()), rows)
+
+
+def controls(measured: dict[str, Any]) -> str:
+    """Yielding of the memory's variants, by number of demonstrations, with 95 % intervals."""
+    sizes = measured["sizes"]
+    rows = [
+        [name, *(_interval(found[name]) for found in sizes.values())]
+        for name in next(iter(sizes.values()))
+    ]
+    return markdown(("`share_07_of_teacher`", *(f"{size} episodes" for size in sizes)), rows)
+
+
+def rules(measured: dict[str, Any]) -> str:
+    """Yielding with each rule or constant changed alone, with 95 % intervals."""
+    rows = [
+        [name, _interval(found), _shown(found["travel_of_teacher"])]
+        for name, found in measured["variants"].items()
+    ]
+    return markdown(("changed", "`share_07_of_teacher`", "`travel_of_teacher`"), rows)
+
+
+# What each table is made of, in the order of its arguments.
+TABLES: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
+    "default": (default, ("eval_default",)),
+    "literal": (literal, ("eval_default", "eval_literal")),
+    "yield": (yielding, ("eval_default",)),
+    "open_loop": (open_loop, tuple(ROBOTS)),
+    "controls": (controls, ("yield_controls",)),
+    "rules": (rules, ("rules",)),
+}
+
+
+def write(results: Path, root: Path) -> list[str]:
+    """Replace what stands between the markers of all pages.
+
+    Args:
+        results: Folder of the results.
+        root: Folder of README.md and docs/.
+
+    Returns:
+        What was done to each table, a line each. A table whose results are not there stays.
+    """
+    done = []
+    for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
+        text = page.read_text()
+
+        def replaced(match: re.Match[str], page: Path = page) -> str:
+            begin, name, _, end = match.groups()
+            if name not in TABLES:
+                done.append(f"{page}: no table {name!r}, valid: {', '.join(TABLES)}")
+                return match[0]
+            make, sources = TABLES[name]
+            paths = [results / f"{source}.json" for source in sources]
+            missing = [str(path) for path in paths if not path.exists()]
+            if missing:
+                done.append(f"{page}: {name} stays as it is without {', '.join(missing)}")
+                return match[0]
+            done.append(f"{page}: {name}")
+            return f"{begin}{make(*(json.loads(path.read_text()) for path in paths))}\n{end}"
+
+        written = MARKED.sub(replaced, text)
+        if written != text:
+            page.write_text(written)
+    return done
+
+
+def _row(name: str, goal: float, more: bool, values: Sequence[float | None]) -> list[str]:
+    return [name, f"{'≥' if more else '≤'} {goal:,}", *(_shown(value) for value in values)]
+
+
+def _interval(figures: dict[str, Any]) -> str:
+    low, high = figures["share_07_of_teacher_interval"]
+    return f"{figures['share_07_of_teacher']:.2f} ({low:.2f} to {high:.2f})"
+
+
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "none"
+    return f"{value:,}" if isinstance(value, int) else f"{value:.3g}"
 
 
 def main() -> None:
-    """Replace the tables between the README's markers."""
-    options = draccus.parse(config_class=Options)
-    default, literal = (
-        json.loads((folder / "metrics.json").read_text())
-        for folder in (options.default, options.literal)
-    )
-    policies = json.loads(options.policies.read_text())
-    text = options.readme.read_text()
-    printed = "```\n" + re.sub(r" +$", "", table(default), flags=re.M) + "\n```"
-    tables = {
-        "default": printed,
-        "literal": comparison(default, literal),
-        "contestants": contestants(policies["contestants"]),
-        "goals": goal_table(policies["goals"]),
-    }
-    for name, content in tables.items():
-        before, _, rest = text.partition(f"<!-- table:{name} -->\n")
-        _, end, after = rest.partition(f"<!-- /table:{name} -->")
-        text = f"{before}<!-- table:{name} -->\n{content}\n{end}{after}"
-    options.readme.write_text(text)
+    """Write all tables."""
+    options = parse_options(Options)
+    print(*write(options.results, options.root), sep="\n")
 
 
 if __name__ == "__main__":

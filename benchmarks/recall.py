@@ -3,14 +3,11 @@
 uv run benchmarks/recall.py --output_dir=outputs/benchmarks/recall
 
 One process times all contestants in turn, round after round, and reports medians. torchhd and
-faiss-cpu are used where they are installed. Writes a table, results.json and recall.png.
+faiss-cpu are used where they are installed. Writes a table, recall.json and recall.png.
 """
 
-import argparse
 import gc
-import json
 import os
-import platform
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.machine import print_machine, save_json
+from hasm_torch.apps.command_line import parse_options
 from hasm_torch.memory.recall import recall_packed, unpack
 
 VALUES = 8  # joints
@@ -34,6 +33,19 @@ PAUSE = 0.003  # s; lets the threads of the contestant before go to sleep
 BURST = 0.002  # s; fast calls are timed several at a time
 
 Contestants = dict[str, Callable[[], Any]]
+
+
+@dataclass
+class Options:
+    """Options of the command line.
+
+    Attributes:
+        quick: A few sizes, a few rounds.
+        output_dir: Where the results go.
+    """
+
+    quick: bool = False
+    output_dir: Path = Path("outputs/benchmarks/recall")
 
 
 @dataclass
@@ -52,15 +64,9 @@ class Result:
 
 
 def main() -> None:
-    """Run with the options of the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--output_dir", type=Path, default=Path("outputs/benchmarks/recall"))
-    parser.add_argument("--quick", action="store_true", help="a few sizes, a few rounds")
-    options = parser.parse_args()
-    options.output_dir.mkdir(parents=True, exist_ok=True)
-
-    machine = describe_machine()
-    print("\n".join(f"{name}: {value}" for name, value in machine.items()))
+    """Time every size, print tables, write the results and their figure."""
+    options = parse_options(Options)
+    print_machine()
     rounds = 5 if options.quick else 15
     results: list[Result] = []
     with torch.inference_mode():
@@ -69,35 +75,10 @@ def main() -> None:
                 results += run_size(device, dim, rows, options.quick, rounds)
                 gc.collect()
     summarise(results)
-    (options.output_dir / "results.json").write_text(
-        json.dumps(
-            {"machine": machine, "beta": BETA, "results": [asdict(result) for result in results]},
-            indent=1,
-        )
-    )
+    content = {"beta": BETA, "results": [asdict(result) for result in results]}
+    print(save_json(options.output_dir, "recall", content))
     plot(results, options.output_dir / "recall.png")
-    print(f"\nwritten: {options.output_dir / 'results.json'}, {options.output_dir / 'recall.png'}")
-
-
-def describe_machine() -> dict[str, object]:
-    """What the benchmark runs on."""
-    model = platform.processor()
-    if os.path.exists("/proc/cpuinfo"):
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        model = next(
-            (line.split(": ")[1] for line in lines if line.startswith("model name")), model
-        )
-    machine: dict[str, object] = {
-        "processor": model,
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "vector instructions": torch.backends.cpu.get_cpu_capability(),
-        "torch": torch.__version__,
-        "load before": [round(load, 2) for load in os.getloadavg()],
-    }
-    if torch.cuda.is_available():
-        machine["gpu"] = torch.cuda.get_device_name()
-    return machine
+    print(options.output_dir / "recall.png")
 
 
 def sizes(device: str, quick: bool) -> Iterator[tuple[int, int]]:
@@ -295,22 +276,13 @@ def reading(copying: Result) -> float:
 
 def plot(results: list[Result], path: Path) -> None:
     """Time a recall over the number of associations, log-log, by batch and code length."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    from matplotlib.figure import Figure
 
     panels = sorted({(r.device, r.batch, r.dim) for r in results})
     dims = sorted({dim for _, _, dim in panels})
     lines = sorted({(device, batch) for device, batch, _ in panels})
-    figure, axes = pyplot.subplots(
-        len(lines),
-        len(dims),
-        figsize=(4.5 * len(dims), 3.5 * len(lines)),
-        squeeze=False,
-        sharex=True,
-        layout="constrained",
-    )
+    figure = Figure(figsize=(4.5 * len(dims), 3.5 * len(lines)), layout="constrained")
+    axes = figure.subplots(len(lines), len(dims), squeeze=False, sharex=True)
     for device, batch, dim in panels:
         panel = axes[lines.index((device, batch))][dims.index(dim)]
         chosen = [r for r in results if (r.device, r.batch, r.dim) == (device, batch, dim)]

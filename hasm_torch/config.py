@@ -1,16 +1,16 @@
 """The settings of the method."""
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-SHARED = "shared"  # name of the memory that all patches share
+POSITIVE = ("current_per_newton", "max_rate", "force_window_s", "rate_window_s", "pair_window_s")
 
 
 @dataclass
 class HASMConfig:
-    """Settings of the method; the defaults are what the project measured as best.
+    """Settings of the method; what is "auto" or None is chosen from the episodes by ``fit``.
 
     ``HASMConfig.literal()`` gives the paper's reading instead.
 
@@ -19,63 +19,64 @@ class HASMConfig:
         bits: Entries a neuron, n.
         width: Tuning width σ in neuron spacings.
         code: "binary", "gray" or "thermometer".
-        threshold: Soft threshold τ on the L1 norm of a cell's forces, N.
-        force_window: Window Δt over which the force accumulates, samples.
-        current_per_newton: Synaptic current a newton of (window-averaged) effective force.
-        spike_dt_ms: Integration step of the Izhikevich neurons, ms.
+        ranks: Which neurons are the most active ones in the touch code: "fixed", those of a fixed
+            order, so that the code tells the force alone; "place", those of the place code.
+        threshold: Soft threshold τ on the L1 norm of a cell's forces, in the skin's unit; None is
+            0.05 N for a skin that reads newtons, else the resting level of the episodes.
+        force_window_s: Window Δt over which the force accumulates, s; at least one sample.
+        current_per_newton: Synaptic current a newton of (window-averaged) effective force; None is
+            2.5 for a skin that reads newtons, else the strongest touch drives a current of 40.
+        spike_dt_ms: Longest integration step of the Izhikevich neurons, ms.
         max_rate: Spike rate R at which the rate density ρ saturates, 1/s.
         rate_window_s: Window in which the spike rate is counted, s.
         pair_window_s: How near a spike must be for a sample to be stored, s.
         pattern: Which series is memorised: the commanded ("action") or the measured ("state")
             joint positions.
-        store: "distinct" keeps the distinct codes of a walk (see ``successors``); "sample" keeps
-            every sample, followed by the sample ``horizon`` later.
-        resolution: Entries in which codes must differ to be distinct, with ``store="distinct"``.
-        horizon: Samples to the successor, with ``store="sample"``.
-        advance: "spike": every spike advances the recall along the walk; "tick": one recall from
-            the measured joints a control step.
-        code_joints: "moved" codes only the joints that a patch's episodes move and leaves the
-            others where they are; "all" codes and commands every joint.
-        touch_levels: "nearest" stores one rate density an episode and recalls at the nearest
-            stored one; "exact" uses the rate density of each sample as it is.
-        ranks: Which neurons are ranked together for the N most active: "joint", those of each
-            joint, so that the posture of one does not change the touch code at another; "all".
-        memories: "patch" gives every patch a memory of its own; "shared" stores all in one, which
-            tells patches apart by the rotation of the touch alone.
-        rope: Whether touch codes are rotated (RoPE3D).
-        frame: Frame in which the direction of a touch rotates its code: "link", of the link that
-            carries the patch, where it is the same in every posture; "base", of the robot's base,
-            where it keeps its meaning in space (the bundled HSR's joints only).
-        rebinarise: Whether rotated codes return to ±1 by sign before they are bound.
+        touch: What tells touches apart: "direction" of the force, "patch", or "auto".
+        rope: Whether touch codes are rotated by the direction of the force (RoPE3D).
+        rope_angle: Angle θ of the rotation, rad; None is 90° for the weighted mean and 45° for the
+            first-order read-out.
+        frame: Frame of the direction: "base" of the robot, or "link", where it is a constant of
+            each cell.
+        value: What is recalled: the "displacement" of a spike, the next state of a walk
+            ("successor"), the course to the "goal" of a touch, or "auto".
+        readout: The weighted "mean" of what is recalled, "first_order", or "auto".
+        beta: Inverse temperature β of the inner products; infinity is the argmax.
+        joints: Names of the coded joints.
+        drive: What moves the robot on: every "spike", or "time" alone; "auto".
+        horizon: Samples over which a displacement is taken.
+        distinct: Whether a walk keeps distinct states only, see ``memory.successors``; if not, a
+            state is followed by that ``horizon`` samples later.
+        resolution: Entries in which codes must differ to be distinct.
         storage: How associations are held, see ``HeteroAssociativeMemory``.
-        beta: Inverse temperature; None derives it from the margin of the stored memory.
     """
 
     neurons: int = 10
     bits: int = 16
-    width: float = 1.0
+    width: float = 2.0
     code: Literal["binary", "gray", "thermometer"] = "thermometer"
-    threshold: float = 0.05
-    force_window: int = 3
-    current_per_newton: float = 2.5
+    ranks: Literal["fixed", "place"] = "fixed"
+    threshold: float | None = None
+    force_window_s: float = 0.06
+    current_per_newton: float | None = None
     spike_dt_ms: float = 0.1
     max_rate: float = 800.0
     rate_window_s: float = 0.2
     pair_window_s: float = 0.05
     pattern: Literal["action", "state"] = "action"
-    store: Literal["distinct", "sample"] = "distinct"
-    resolution: int = 4
-    horizon: int = 1
-    advance: Literal["spike", "tick"] = "spike"
-    code_joints: Literal["moved", "all"] = "moved"
-    touch_levels: Literal["nearest", "exact"] = "nearest"
-    ranks: Literal["joint", "all"] = "joint"
-    memories: Literal["patch", "shared"] = "patch"
+    touch: Literal["auto", "direction", "patch"] = "auto"
     rope: bool = True
-    frame: Literal["link", "base"] = "link"
-    rebinarise: bool = True
-    storage: Literal["float32", "bfloat16", "int8", "bit"] = "bit"
+    rope_angle: float | None = None
+    frame: Literal["base", "link"] = "base"
+    value: Literal["auto", "displacement", "successor", "goal"] = "auto"
+    readout: Literal["auto", "mean", "first_order"] = "auto"
     beta: float | None = None
+    joints: list[str] | None = None
+    drive: Literal["auto", "spike", "time"] = "auto"
+    horizon: int = 5
+    distinct: bool = True
+    resolution: int = 4
+    storage: Literal["float32", "bfloat16", "int8", "bit"] = "bit"
 
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
@@ -84,46 +85,40 @@ class HASMConfig:
                 raise ValueError(
                     f"unknown {name} {getattr(self, name)!r}, valid: {', '.join(valid)}"
                 )
-        for name in ("current_per_newton", "max_rate", "rate_window_s", "pair_window_s"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"{name} must be finite and above 0, got {getattr(self, name)}")
+        for name in POSITIVE:
+            value = getattr(self, name)
+            if value is not None and not 0 < value < float("inf"):
+                raise ValueError(f"{name} must be finite and above 0, got {value}")
+        if self.horizon < 1:
+            raise ValueError(f"horizon must be at least 1 sample, got {self.horizon}")
+        if self.beta is not None and not self.beta >= 0:
+            raise ValueError(f"beta must be 0 or above (inf is the argmax), got {self.beta}")
 
     @classmethod
     def literal(cls) -> "HASMConfig":
-        """The paper as written: 4-bit binary codes of all joints, every sample, one recall a tick.
+        """The paper as written.
 
-        β = 2 stands for "a value bigger than 1".
+        4-bit binary codes of the moved joints, samples and their successors, real-valued codes, one
+        recall a control step. β = 2 stands for "a value bigger than 1". The text leaves the step of
+        S₋₁ open: 30 samples, 0.6 s at 50 Hz, are the shortest that leave the range of one 4-bit
+        code at the speed of the demonstrations. Every patch has a key, as if it had a memory of its
+        own.
         """
         return cls(
             bits=4,
+            width=1.0,
             code="binary",
+            ranks="place",
             pattern="state",
-            store="sample",
-            advance="tick",
-            code_joints="all",
-            touch_levels="exact",
-            ranks="all",
-            rebinarise=False,
-            storage="float32",
+            touch="patch",
+            value="successor",
+            readout="mean",
             beta=2.0,
+            drive="spike",
+            horizon=30,
+            distinct=False,
+            storage="float32",
         )
-
-
-@dataclass
-class MemoryShape:
-    """What one patch's memory needs to be built again.
-
-    Attributes:
-        joints: Indices of the joints that it codes.
-        capacity: Associations that it holds.
-        touch_levels: Number of stored rate densities.
-        patches: Names of the patches that share the memory; empty where it belongs to one.
-    """
-
-    joints: list[int]
-    capacity: int
-    touch_levels: int
-    patches: list[str] = field(default_factory=list)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

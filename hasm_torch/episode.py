@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 STATE, TACTILE, ACTION = "observation.state", "observation.tactile", "action"
+ENVIRONMENT = "observation.environment_state"
 
 
 @dataclass(eq=False)
@@ -19,6 +20,8 @@ class Episode:
         action: ``(T, A)`` float32 joint targets; A = J wherever an action is a target per joint.
         tactile: ``(T, cells, channels)`` float32 skin readings, or None without skin. Three
             channels are forces in N, one is a pressure, six are a wrench.
+        observations: ``(T, N)`` float32 further observations that are bound, side by side in the
+            order of `EpisodeSet.observations`, or None where there are none.
     """
 
     index: int
@@ -27,6 +30,7 @@ class Episode:
     state: np.ndarray
     action: np.ndarray
     tactile: np.ndarray | None = None
+    observations: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.state)

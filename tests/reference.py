@@ -105,6 +105,53 @@ def rope3d_literal(q: ArrayLike, angle: float) -> Array:
     return out
 
 
+def link_rotation(rows: ArrayLike, q: ArrayLike) -> Array:
+    """Rotation of a link in the base frame: the product of R_fixed · Rot(axis, m q[j] + o)."""
+    whole = np.eye(3)
+    for *entries, joint, multiplier, offset in np.asarray(rows, dtype=np.float64).reshape(-1, 15):
+        angle = offset + (multiplier * np.asarray(q)[int(joint)] if joint >= 0 else 0.0)
+        whole = whole @ np.reshape(entries[:9], (3, 3)) @ rodrigues(entries[9:], angle)
+    return whole
+
+
+def push(forces: ArrayLike, normals: ArrayLike, threshold: float, window: int) -> Array:
+    """What a touch exerts on one patch, a mean over the window: (T, cells, 3) -> (T, 3)."""
+    forces = np.asarray(forces, dtype=np.float64)
+    total = np.zeros((len(forces), 3))
+    for now in range(len(forces)):
+        for then in range(max(0, now - window + 1), now + 1):
+            for cell, normal in zip(forces[then], np.asarray(normals), strict=True):
+                total[now] -= max(0.0, sum(abs(f) for f in cell) - threshold) * normal
+    return total / window
+
+
+def touch_code(
+    rho: float, levels: ArrayLike, bits: int, key: ArrayLike, axis: ArrayLike, angle: float,
+    mixing: ArrayLike,
+) -> Array:  # fmt: skip
+    """o = Q · RoPE3D(k ⊗ F; n, angle) of one touch; an axis of zero turns and mixes nothing."""
+    touch = np.asarray(key) * tactile_embedding(rho, levels, bits)
+    if not angle or not np.any(axis):
+        return touch
+    mixed = np.eye(len(touch))  # the last one or two entries stay
+    for i, block in enumerate(np.asarray(mixing, dtype=np.float64)):
+        mixed[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = block
+    return mixed @ rope3d_matrix(len(touch), axis, angle) @ touch
+
+
+def linear_law(values: ArrayLike, x: ArrayLike, weights: ArrayLike, ridge: ArrayLike) -> Array:
+    """C of the law d = C x with the least Σ w |d − C x|² + Σ λ_i |C_i|², (V, X).
+
+    Values (K, V), covariates (K, X), weights (K,) and λ (X,), one a column C_i of C: a least
+    squares problem with a row more a covariate.
+    """
+    values, x = np.asarray(values, dtype=np.float64), np.asarray(x, dtype=np.float64)
+    root = np.sqrt(np.asarray(weights, dtype=np.float64))[:, None]
+    rows = np.vstack([root * x, np.diag(np.sqrt(ridge))])
+    wanted = np.vstack([root * values, np.zeros((len(ridge), values.shape[1]))])
+    return np.linalg.lstsq(rows, wanted, rcond=None)[0].T
+
+
 def izhikevich(
     current: ArrayLike, duration: float, step: float,
     a: float = 0.02, b: float = 0.2, c: float = -50.0, d: float = 0.5, v_th: float = 30.0,

@@ -1,7 +1,5 @@
-"""The body of any dataset: limits, units, layouts of touch, no touch; learning from each."""
+"""The body of any dataset: limits, units, layouts of touch, how links turn, no touch."""
 
-import importlib
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +10,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch import HASM, HASMConfig
-from hasm_torch.apps.training import FeaturesConfig, RobotConfig, describe, train
 from hasm_torch.body import Body
 from hasm_torch.data import (
     Episode,
@@ -21,15 +17,16 @@ from hasm_torch.data import (
     EpisodeStream,
     FeatureMap,
     SkinPatch,
-    iter_episodes,
     load_episodes,
     open_episodes,
+    skin_patches,
     write_episodes,
 )
 from hasm_torch.data.body import body_of, describe_body, limits_of
-from hasm_torch.encoders.readings import DIRECTIONS, as_forces, forces_of
+from hasm_torch.encoders.readings import PUSHES, as_forces, forces_of
 from hasm_torch.encoders.skin import spike_step
-from hasm_torch.model.checkpoint import TACTILE, features
+from hasm_torch.encoders.turning import link_rotation
+from hasm_torch.robot import JOINTS, Skin
 
 RECORDINGS = Path(__file__).parents[2] / "shared" / "data"
 URDF = """<robot name="made">
@@ -105,9 +102,9 @@ def test_limits_follow_the_order_of_the_dataset(urdf):
 
 def test_limits_of_the_bundled_robot():
     names = ("arm_flex_joint", "wrist_roll_joint")
-    data = replace(dataset(), joints=names, units=("rad", "rad"))
+    data = replace(dataset(None), joints=names, units=("rad", "rad"))
     data = replace(data, episodes=[replace(e, state=-e.state) for e in data])
-    assert "bundled" in describe_body(data, body_of(data))[0]
+    assert "hsr.urdf" in describe_body(data, body_of(data))[0]
     assert body_of(data).lower[0] == pytest.approx(-2.62)
 
 
@@ -115,8 +112,9 @@ def test_limits_of_the_data():
     """State and targets both fit; a joint that stands still gets a little room."""
     data = dataset()
     wide = replace(data.episodes[1], action=data.episodes[1].action + np.float32(0.25))
-    limits = limits_of(replace(data, episodes=[data.episodes[0], wide]))
-    assert limits.source == "the range of the data"
+    both = replace(data, episodes=[data.episodes[0], wide])
+    limits = limits_of(both)
+    assert describe_body(both, body_of(both))[0] == "joint limits: the range of the data"
     assert (limits.lower[0], limits.upper[0]) == pytest.approx((0.0, 1.75))
     assert limits.max_speed[0] == pytest.approx(1.5 / 29 * FPS, rel=1e-5)
     still = limits_of(data)
@@ -126,13 +124,18 @@ def test_limits_of_the_data():
         limits_of(replace(data, episodes=[]))
 
 
-def test_what_a_urdf_leaves_open_comes_from_the_data(tmp_path):
+@pytest.mark.parametrize("limit", ["", '<limit effort="1"/>', '<limit lower="0" effort="1"/>'])
+def test_joints_that_a_urdf_does_not_limit_have_no_limits(tmp_path, limit):
     path = tmp_path / "open.urdf"
-    path.write_text(URDF.format(kind="continuous", limit=""))
-    limits = limits_of(dataset(), path)
-    assert limits.upper[0] == 2.0
-    assert limits.lower[1] < 0.1 < limits.upper[1]
-    assert np.isfinite(limits.max_speed).all()
+    path.write_text(URDF.format(kind="continuous", limit=limit))
+    far = with_state(dataset(), lambda state: state.__setitem__((3, 1), 900.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = body_of(far, path)
+    assert (found.lower, found.upper) == ([-1.0, -np.inf], [2.0, np.inf])
+    assert found.limited == [0]
+    assert np.isfinite(found.max_speed).all()  # of what nothing limits, the data's
+    assert found.max_speed[1] > 0
 
 
 def test_urdf_of_another_robot(urdf, tmp_path):
@@ -197,13 +200,13 @@ def test_forces_and_pressures():
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-50, 50), min_size=6, max_size=6))
 def test_wrench_keeps_force_and_direction(wrench):
-    """The six pushes along their directions add up to the force; the torque is left aside."""
+    """Six pushes against their cells' normals add up to the force; the torque is left aside."""
     pushes = as_forces(torch.tensor([wrench], dtype=torch.float64))
     assert pushes.shape == (6, 3)
     assert (pushes >= 0).all()
-    directions = torch.tensor(list(DIRECTIONS.values()), dtype=torch.float64)
+    normals = torch.tensor(PUSHES, dtype=torch.float64)
     torch.testing.assert_close(
-        (pushes.sum(-1, keepdim=True) * directions).sum(0),
+        -(pushes.sum(-1, keepdim=True) * normals).sum(0),
         torch.tensor(wrench[:3], dtype=torch.float64),
     )
 
@@ -214,60 +217,75 @@ def test_body_of_each_layout(name, channels):
     found = body_of(data)
     assert found.channels == channels
     assert found.readings == data.episodes[0].tactile[0].size
-    if name == "wrench":
-        assert found.patches == [f"fore {direction}" for direction in DIRECTIONS]
-        assert found.directions == [list(d) for d in DIRECTIONS.values()]
-        assert found.cells == [1] * 6
+    if name == "wrench":  # one patch that feels all directions
+        assert (found.patches, found.cells) == (["fore"], [6])
+        assert found.normals == [list(push) for push in PUSHES]
     else:
         assert (found.patches, found.cells) == (["fore", "back"], [2, 2])
-        assert found.directions == [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]
-        assert found.links == ["", "upper"]
+        assert found.normals == [[0.0, 0.0, 1.0]] * 2 + [[0.0, 1.0, 0.0]] * 2
+        assert (found.links, found.groups) == (["", "upper"], [0, 1])
+    assert (found.chains, found.base, found.unit) == ({}, [], "N")
     assert str(found.readings // channels) in describe_body(data, found)[1]
 
 
-@pytest.mark.parametrize(("name", "channels"), LAYOUTS.items())
-def test_each_layout_is_learned_and_recalled(name, channels):
-    """A touch moves the elbow on; the other way round, and at rest, it stays."""
-    data = dataset(channels)
-    model = HASM(HASMConfig(), body_of(data))
-    report = model.fit(data)
-    patch = "fore -x" if name == "wrench" else "fore"
-    assert list(report.associations) == [patch]
-    assert report.joints[patch] == ["elbow"]
-    start, touched = torch.from_numpy(data.episodes[0].state[0]), data.episodes[0].tactile[5]
-
-    def after(skin):
-        model.reset()
-        target = start
-        for _ in range(10):
-            target = model.step(target, torch.from_numpy(skin))
-        return float(target[0])
-
-    moved = after(touched)
-    assert moved > 0.05
-    assert after(touched.ravel()) == moved  # flat, as LeRobot gives it
-    assert after(0 * touched) == 0.0
-    if name == "wrench":
-        assert after(-touched) == 0.0
+def test_patches_of_unknown_links_are_no_part_of_each_other():
+    data = dataset()
+    skin = {name: replace(patch, link=None) for name, patch in data.skin.items()}
+    assert body_of(replace(data, skin=skin)).groups == [0, 1]
+    one = {name: replace(patch, link="upper") for name, patch in data.skin.items()}
+    assert body_of(replace(data, skin=one)).groups == [0, 0]
 
 
-def test_without_touch_a_sequence_plays_back():
+def test_a_urdf_says_how_links_turn(urdf):
+    """Where the elbow bends about x, the skin behind it turns with it."""
+    data = dataset()
+    other = replace(data, skin={**data.skin, "fore": replace(data.skin["fore"], link="paw")})
+    with pytest.warns(UserWarning, match=r"made.urdf has no link paw, which carry skin"):
+        found = body_of(other, urdf)
+    assert list(found.chains) == ["upper"]
+    found = body_of(data, urdf)
+    bend = 0.3
+    positions = np.array([[bend, 0.2]])
+    turn = link_rotation(np.array(found.chains["upper"]), positions)[0]
+    cosine, sine = np.cos(bend), np.sin(bend)
+    expected = [[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]]
+    np.testing.assert_allclose(turn, expected, atol=1e-12)
+    fixed = {name: replace(patch, link=link) for (name, patch), link in
+             zip(data.skin.items(), ("upper", "tip"))}  # fmt: skip
+    assert body_of(replace(data, skin=fixed), urdf).groups == [0, 1]  # the slide is between them
+
+
+def test_the_bundled_robot_has_a_base_and_links_that_turn():
+    skin, state = Skin.load(), np.zeros((5, len(JOINTS)), np.float32)
+    tactile = np.zeros((5, skin.cells, 3), np.float32)
+    time = np.arange(5) / FPS
+    data = EpisodeSet(
+        [Episode(0, "stand", time, state, state, tactile)], float(FPS), JOINTS, ("rad",) * 11,
+        skin_patches(skin), Path("made"), JOINTS, {"observation.environment_state": 3},
+    )  # fmt: skip
+    found = body_of(data)
+    assert found.base == ["odom_x", "odom_y", "odom_t"]
+    assert found.max_speed[-3:] == [0.2, 0.2, 1.0]
+    assert found.limited == list(range(8))
+    assert set(found.chains) == set(skin.link.values())
+    by_patch = dict(zip(found.patches, found.groups))
+    assert len({group for name, group in by_patch.items() if "wrist" in name}) == 1
+    assert by_patch["torso_front"] == by_patch["torso_left"] != by_patch["wrist_left"]
+    np.testing.assert_allclose(found.normals, skin.normals, atol=1e-9)
+    assert found.observations == {"observation.environment_state": 3}
+    text = "\n".join(describe_body(data, found))
+    assert "mobile base: odom_x, odom_y, odom_t" in text
+    assert "bound besides: observation.environment_state (3)" in text
+    arm = replace(data, joints=JOINTS[:8], action_names=JOINTS[:8], episodes=[
+        replace(data.episodes[0], state=state[:, :8], action=state[:, :8])])  # fmt: skip
+    assert body_of(arm).base == []  # a base that was not recorded stands still
+
+
+def test_a_body_without_touch():
     data = dataset(None)
     found = body_of(data)
     assert (found.patches, found.channels, found.readings) == (["sequence"], 0, 0)
     assert "no touch in this dataset: a plain sequence memory" in describe_body(data, found)
-    assert TACTILE not in features(found)[0]
-    model = HASM(HASMConfig(), found)
-    model.fit(data)
-    state = torch.from_numpy(data.episodes[0].state[0])
-    positions = [float(state[0])]
-    for _ in range(80):
-        state = model.step(state, None)
-        positions.append(float(state[0]))
-    assert (np.diff(positions) >= -1e-6).all()
-    assert positions[-1] == pytest.approx(1.5, abs=0.05)
-    # at about the recorded pace: half way after half of the recording
-    assert 0.4 < positions[15] < 1.1
 
 
 def test_readings_that_do_not_fit():
@@ -309,29 +327,6 @@ def stored(request, tmp_path) -> tuple[Path, EpisodeSet]:
     return root, data
 
 
-def test_training_on_any_layout(stored, tmp_path):
-    root, data = stored
-    trained = train(root, HASMConfig())
-    text = describe(trained)
-    assert "the range of the data" in text
-    assert ("no touch" in text) == (data.skin is None)
-    if data.skin is not None:  # the unit is no newton: threshold and current are the data's
-        assert trained.model.config.current_per_newton != HASMConfig().current_per_newton
-    trained.model.save_pretrained(tmp_path / "saved")
-    loaded = HASM.from_pretrained(tmp_path / "saved")
-    assert loaded.body == trained.model.body
-
-
-def test_features_and_robot_by_option(stored, urdf):
-    root, _ = stored
-    names = FeaturesConfig(state="action", tactile="none", action="observation.state")
-    trained = train(root, HASMConfig(), names, RobotConfig(urdf))
-    assert trained.model.body.upper == [2.0, 0.5]
-    assert "no touch" in describe(trained)
-    with pytest.raises(ValueError, match=r"Expected a feature 'joints'"):
-        train(root, HASMConfig(), FeaturesConfig(state="joints"))
-
-
 def test_stream_reads_the_same_episodes(stored):
     root, _ = stored
     whole, stream = load_episodes(root), EpisodeStream(root)
@@ -344,26 +339,9 @@ def test_stream_reads_the_same_episodes(stored):
             np.testing.assert_array_equal(mine.time, theirs.time)
             if theirs.tactile is not None:
                 np.testing.assert_array_equal(mine.tactile, theirs.tactile)
-    assert next(iter(iter_episodes(root, FeatureMap(tactile=None)))).tactile is None
+    assert next(iter(EpisodeStream(root, FeatureMap(tactile=None)))).tactile is None
     assert isinstance(open_episodes(root), EpisodeSet)
     assert isinstance(open_episodes(root, most_bytes=10), EpisodeStream)
-
-
-def test_options_of_the_command_line(stored, urdf, tmp_path, monkeypatch, capsys):
-    root, data = stored
-    if data.skin is not None:
-        pytest.skip("one layout is enough for the command line")
-    options = [
-        f"--dataset.root={root}",
-        f"--robot.urdf={urdf}",
-        "--features.state=action",
-        f"--output_dir={tmp_path}/out",
-    ]
-    monkeypatch.setattr(sys, "argv", ["train.py", *options])
-    importlib.import_module("train").main()
-    printed = capsys.readouterr().out
-    assert "no touch in this dataset" in printed
-    assert str(urdf) in printed
 
 
 @pytest.mark.skipif(not RECORDINGS.is_dir(), reason="real recordings are not at hand")

@@ -1,36 +1,37 @@
 """The figures of the compliance experiment on traces whose answers are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hasm_torch.evaluation.along_force import Motion
 from hasm_torch.evaluation.compliance import (
-    BEHAVIOURS,
     END_AT,
     RELEASE_AT,
     ROOM,
     TOUCH_AT,
-    Behaviour,
     ComplianceCase,
-    Push,
     cases,
+    even_push,
+    led,
     measure,
-    r_squared,
-    spearman,
     start_posture,
     summarise,
-    tracking,
 )
-from hasm_torch.evaluation.report import table
+from hasm_torch.evaluation.correlation import r_squared, spearman, tracking
 from hasm_torch.evaluation.rollout import Trace, limit_violations
 from hasm_torch.robot import JOINTS
+from hasm_torch.sim.tasks import BEHAVIOURS, UPRIGHT, Behaviour
 
 PERIOD = 0.02
 NAMES = ("lift", "elbow")
 LOWER, UPPER, SPEED = np.array([0.0, -2.0]), np.array([1.0, 2.0]), np.array([0.5, 1.0])
-UP, DOWN = Behaviour("up", "under", "elbow", +1), Behaviour("down", "upper", "elbow", -1)
+UP = Behaviour("up", "under", "elbow", +1, "push it up")
+DOWN = Behaviour("down", "upper", "elbow", -1, "push it down")
 
 
 def trace(elbow: np.ndarray, force: np.ndarray | float = 5.0) -> Trace:
@@ -38,14 +39,19 @@ def trace(elbow: np.ndarray, force: np.ndarray | float = 5.0) -> Trace:
     time = PERIOD * np.arange(1, len(elbow) + 1)
     state = np.stack([np.full(len(time), 0.5), elbow], axis=1)
     touched = (time >= TOUCH_AT) & (time <= RELEASE_AT)
+    forces = np.zeros((len(time), 2, 3))
+    forces[:, 0, 2] = np.where(touched, force, 0.0)
     return Trace(
         time=time,
         state=state,
         target=state.copy(),
         velocity=np.gradient(state, PERIOD, axis=0),
-        force=np.where(touched, force, 0.0),
-        patch=[None] * len(time),
-        object_height=np.full(len(time), np.nan),
+        patch=np.stack([np.where(touched, "under", ""), np.full(len(time), "")], axis=1),
+        cell=np.full((len(time), 2), -1),
+        force=forces,
+        point=np.zeros((len(time), 2, 3)),
+        object=np.full((len(time), 3), np.nan),
+        height=np.zeros(len(time)),
         success=False,
     )
 
@@ -64,7 +70,7 @@ def figures(elbow: np.ndarray, behaviour: Behaviour, force: np.ndarray | float =
 @pytest.mark.parametrize("speed", [0.1, 0.4])
 def test_an_even_motion(speed):
     measured = figures(ramp(speed), UP)
-    assert measured["displacement"] == pytest.approx(1.5 * speed)
+    assert measured["displacement"] == pytest.approx((RELEASE_AT - TOUCH_AT) * speed)
     assert measured["speed"] == pytest.approx(speed)
     assert measured["force"] == pytest.approx(5.0)
     assert measured["drift"] == 0.0
@@ -73,14 +79,16 @@ def test_an_even_motion(speed):
 
 
 def test_the_wrong_way_is_negative():
-    assert figures(ramp(0.2), DOWN)["displacement"] == pytest.approx(-0.3)
+    assert figures(ramp(0.2), DOWN)["displacement"] == pytest.approx(-0.32)
     assert figures(ramp(0.2), DOWN)["speed"] == pytest.approx(-0.2)
     assert figures(ramp(-0.2), DOWN)["speed"] == pytest.approx(0.2)
 
 
 def test_a_joint_that_creeps_on_after_the_release_drifts():
     creeping = ramp(0.2) + 0.05 * np.clip(TIME - RELEASE_AT, 0.0, None)
-    assert figures(creeping, UP)["drift"] == pytest.approx(0.05 * 1.0, abs=0.05 * 2 * PERIOD)
+    assert figures(creeping, UP)["drift"] == pytest.approx(
+        0.05 * (END_AT - RELEASE_AT - 0.3), abs=0.05 * 2 * PERIOD
+    )
     overshoot = ramp(0.2) + 0.1 * ((TIME > RELEASE_AT) & (TIME < RELEASE_AT + 0.2))
     assert figures(overshoot, UP)["drift"] == 0.0  # its transient is over in time
 
@@ -158,105 +166,71 @@ def test_correlations_of_nothing_are_zero():
     assert spearman(nothing, nothing) == r_squared(nothing, nothing) == 0.0
 
 
-def test_a_push_begins_swells_and_ends():
-    push = Push("under", 8.0, swing=3.0, period=1.0)
-    state = np.zeros(2)
-    assert push.touch(TOUCH_AT - 0.01, state) == (None, 0.0)
-    assert push.touch(TOUCH_AT, state) == ("under", 8.0)
-    assert push.touch(TOUCH_AT + 0.25, state)[1] == pytest.approx(11.0)
-    assert push.touch(TOUCH_AT + 0.75, state)[1] == pytest.approx(5.0)
-    assert push.touch(RELEASE_AT, state) == (None, 0.0)
-    assert not push.finished(RELEASE_AT, state)
-    assert push.finished(END_AT, state)
-    even = {Push("under", 8.0).touch(t, state)[1] for t in np.arange(TOUCH_AT, RELEASE_AT, 0.1)}
-    assert even == {8.0}
-
-
 def test_cases_are_planned_from_the_seed():
-    planned = cases(8, [], seed=3)
-    assert planned == cases(8, [], seed=3)
-    assert planned != cases(8, [], seed=4)
-    for index in range(len(BEHAVIOURS)):
+    planned = cases(8, seed=3)
+    assert planned == cases(8, seed=3)
+    assert planned != cases(8, seed=4)
+    for index, behaviour in enumerate(BEHAVIOURS):
         mine = [case for case in planned if case.behaviour == index]
         assert [case.changing for case in mine] == [False] * 8 + [True] * 2
-        assert all(2.0 <= case.force <= 14.0 for case in mine)
-    taken_in_turn = [c.force for c in cases(5, [3.0, 9.0], 0) if not c.changing][:5]
-    assert taken_in_turn == [3.0, 9.0, 3.0, 9.0, 3.0]
+        for case in mine:
+            [(patch, (force, cell))] = case.push.pressed.items()
+            assert patch == behaviour.patch
+            assert 2.0 <= force <= 14.0
+            assert cell is not None
+    in_turn = [next(iter(c.push.pressed.values()))[0] for c in cases(5, 0, [3.0, 9.0])][:5]
+    assert in_turn == [3.0, 9.0, 3.0, 9.0, 3.0]
+    assert {BEHAVIOURS[case.behaviour].name for case in led(planned)} == {"arm_down", "arm_up"}
 
 
-@pytest.mark.parametrize("index", range(len(BEHAVIOURS)))
-def test_a_start_leaves_the_yielding_joint_room(index):
-    joints = JOINTS
-    lower, upper = np.arange(8.0), np.arange(8.0) + 2.0
-    behaviour = BEHAVIOURS[index]
-    shares = np.array(
-        [
-            (start_posture(ComplianceCase(index, seed, 5.0, False), joints, lower, upper) - lower)
-            / 2.0
-            for seed in range(50)
-        ]
-    )
-    assert (shares >= 0).all()
-    assert (shares <= 1).all()
-    mine = shares[:, joints.index(behaviour.joint)]
-    ahead = 1 - mine if behaviour.direction > 0 else mine
-    assert ahead.min() >= ROOM
-    assert np.delete(shares, joints.index(behaviour.joint), axis=1).std(axis=0).min() > 0.2
+@pytest.mark.parametrize("behaviour", BEHAVIOURS, ids=lambda b: b.name)
+def test_a_start_leaves_the_yielding_joint_room_and_the_arms_wrist_upright(behaviour):
+    lower, upper = np.arange(11.0) - 5.0, np.arange(11.0) - 3.0
+    lower[-3:], upper[-3:] = -np.inf, np.inf
+    rng = np.random.default_rng(0)
+    starts = np.array([start_posture(behaviour, lower, upper, rng) for _ in range(50)])
+    assert (starts[:, -3:] == 0.0).all()
+    joint = JOINTS.index(behaviour.joint)
+    share = (starts[:, joint] - lower[joint]) / 2.0
+    assert (1 - share if behaviour.direction > 0 else share).min() >= ROOM
+    straight = [JOINTS.index(name) for name in UPRIGHT]
+    upright = (np.abs(starts[:, straight]) <= list(UPRIGHT.values())).all()
+    assert upright == behaviour.name.startswith("arm")
+    free = [j for j in range(8) if j != joint and j not in straight]
+    assert starts[:, free].std(axis=0).min() > 0.4
+
+
+def moved(cos: float) -> Motion:
+    return Motion(cos, 0.1 * cos, 5.0, 0.05, 0.1)
 
 
 def test_figures_of_many_rollouts_are_put_together():
     planned, measured = [], []
-    for index in range(4):
+    for index, behaviour in enumerate(BEHAVIOURS):
         for force in (2.0, 4.0, 8.0):
-            planned.append(ComplianceCase(index, 0, force, False))
+            planned.append(ComplianceCase(index, 0, even_push(behaviour, force)))
             measured.append(
                 {"displacement": 0.1, "drift": 0.001 * force, "others": 0.0, "violations": 1,
-                 "force": force, "speed": 0.05 * force, "tracking": float("nan")}
+                 "force": force, "speed": 0.05 * force, "tracking": float("nan"),
+                 "motion": moved(0.9)}
             )  # fmt: skip
-        planned.append(ComplianceCase(index, 0, 8.0, True))
-        measured.append({**measured[-1], "tracking": 0.9, "displacement": -0.1})
-    summary = summarise(planned, measured)
+        swell = replace(even_push(behaviour, 8.0), swing=2.0)
+        planned.append(ComplianceCase(index, 0, swell))
+        changing = {"tracking": 0.9, "displacement": -0.1, "motion": moved(-0.5)}
+        measured.append({**measured[-1], **changing})
+    summary = summarise(planned, measured, [{"motion": moved(1.0)}] * len(led(planned)))
     assert summary["limit_violations"] == 16
     assert list(summary["behaviours"]) == ["arm_down", "arm_up", "wrist_left", "wrist_right"]
-    for found in summary["behaviours"].values():
+    for name, found in summary["behaviours"].items():
         assert found["direction_correct"] == 0.75
+        assert found["with_force" if name.startswith("arm") else "correct_turn"] == 0.75
+        assert len({"with_force", "correct_turn"} & set(found)) == 1
         assert found["spearman"] == pytest.approx(1.0)
         assert found["r2"] == pytest.approx(1.0)
         assert found["tracking"] == pytest.approx(0.9)
         assert found["release_drift_rad"] == pytest.approx(0.008)
         assert found["velocities"] == [[2.0, 0.1], [4.0, 0.2], [8.0, 0.4]]
-
-
-def metrics(**changes):
-    behaviour = {
-        "direction_correct": 1.0, "spearman": 0.99, "r2": 0.95, "tracking": 0.97,
-        "release_drift_rad": 0.001,
-    }  # fmt: skip
-    return {
-        "compliance": {"behaviours": {"arm_up": {**behaviour, **changes}}, "limit_violations": 0},
-        "grasp": {"success_rate": 0.96, "hold_drift_rad": 0.002, "limit_violations": 0},
-        "train_seconds": 1.5,
-        "memory_bytes": 150_000,
-        "tick_ms": {"median": 0.4, "p99": 0.9},
-    }
-
-
-def test_the_table_marks_what_misses_its_goal():
-    assert "!" not in table(metrics())
-    for key, value in (("spearman", 0.97), ("release_drift_rad", 0.02), ("r2", float("nan"))):
-        marked = [line for line in table(metrics(**{key: value})).splitlines() if "!" in line]
-        assert len(marked) == 1
-        assert key in marked[0]
-    violated = metrics()
-    violated["grasp"]["limit_violations"] = 1
-    assert sum("!" in line for line in table(violated).splitlines()) == 1
-
-
-def test_the_table_has_lines_for_what_was_measured_only():
-    both = table(metrics())
-    assert "train_seconds" in both
-    loaded = metrics()
-    loaded["train_seconds"] = None
-    del loaded["grasp"]
-    assert "train_seconds" not in table(loaded)
-    assert "grasp" not in table(loaded)
+    assert summary["with_force"] == summary["correct_turn"] == 0.75
+    along = summary["along_force"]
+    assert (along["rollouts"], along["share_07"], along["against"]) == (8, 0.75, 0.25)
+    assert along["travel_of_teacher"] == pytest.approx(0.9)

@@ -1,69 +1,60 @@
+"""Courses of touches, speed limits, and displacements as a mobile base sees them."""
+
 import numpy as np
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from toys import make_body
 
-from hasm_torch.model.control import RECALLS_A_STEP, SPEED_SHARE, Walk, advance, limit_speed
+from hasm_torch.model.control import SPEED_SHARE, Course, limit_speed
+from hasm_torch.model.frames import base_indices, into_base, out_of_base
 
-LOWER, UPPER = np.array([-1.0, 0.0]), np.array([1.0, 4.0])
-DENSITY = 0.5
-
-
-class Line:
-    """A memory of a walk through some places; joints 0 and 2 of three."""
-
-    def __init__(self, places: list[list[float]], pace: float) -> None:
-        self.coded, self.span = np.array([0, 2]), UPPER - LOWER
-        self.places, self.pace, self.recalls = np.array(places), pace, 0
-
-    def touch_level(self, density, held=None):
-        return density
-
-    def follow(self, positions, density, link=None, patch=None):
-        self.recalls += 1
-        nearest = int(np.abs(self.places - positions).sum(-1).argmin())
-        return self.places[min(nearest + 1, len(self.places) - 1)], self.pace, np.ones(2, bool)
+POINTS = np.array([[0.0, 0.0], [1.0, 0.5], [1.0, 2.0], [-1.0, 2.5], [-1.0, 2.5]])
+SPIKES = np.array([0.0, 4.0, 10.0, 30.0, 31.0])
 
 
-def steps(memory: Line, spikes: list[float]) -> torch.Tensor:
-    reference, walk = np.array([*memory.places[0, :1], 7.0, *memory.places[0, 1:]]), Walk()
-    seen = []
+def course() -> Course:
+    return Course(POINTS, SPIKES)
+
+
+def test_a_course_is_followed_spike_by_spike():
+    way, here = course(), POINTS[0]
+    for spent, left in ((1, 0), (3, 0), (3, 0), (14, 0), (0, 0), (12, 2)):
+        here, rest = way.advance(here, spent)
+        assert rest == left
+        expected = [np.interp(way.done, SPIKES, column) for column in POINTS.T]
+        np.testing.assert_allclose(here, expected, atol=1e-12)
+    assert way.finished
+    here, rest = way.advance(here, 7.0)
+    assert rest == 7.0
+    np.testing.assert_array_equal(here, POINTS[-1])
+
+
+@given(spikes=st.lists(st.integers(0, 9), min_size=1, max_size=12),
+       offset=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)))  # fmt: skip
+@settings(max_examples=50, deadline=None)
+def test_the_way_depends_on_the_number_of_spikes_alone(spikes, offset):
+    apart, together = course(), course()
+    here = start = POINTS[0] + offset
     for count in spikes:
-        reference = advance(reference, walk, "patch", memory, count, DENSITY)
-        seen.append(reference)
-    return torch.tensor(np.stack(seen)).float()
+        here, _ = apart.advance(here, count)
+    there, _ = together.advance(start, sum(spikes))
+    assert apart.done == together.done == min(sum(spikes), SPIKES[-1])
+    np.testing.assert_allclose(here, there, atol=1e-9)
+    # and a reference beside the course comes back to it at its next point
+    if sum(spikes) >= SPIKES[1]:
+        expected = [np.interp(apart.done, SPIKES, column) for column in POINTS.T]
+        np.testing.assert_allclose(here, expected, atol=1e-9)
 
 
-def test_a_spike_moves_the_fastest_joint_by_one_over_the_pace():
-    memory = Line([[-1.0, 0.0], [1.0, 1.0]], pace=40.0)  # joint 0 over its range, joint 2 a quarter
-    seen = steps(memory, [1, 0, 3, 6])
-    torch.testing.assert_close(seen[:, 0], -1.0 + 2.0 * torch.tensor([1, 1, 4, 10]) / 40)
-    torch.testing.assert_close(seen[:, 2], 1.0 * torch.tensor([1, 1, 4, 10]) / 40)
-    assert (seen[:, 1] == 7.0).all()  # a joint that the memory does not code
-    assert memory.recalls == 1  # the goal is kept until it is reached
-
-
-@given(spikes=st.lists(st.integers(0, 4), min_size=1, max_size=12))
-@settings(max_examples=30, deadline=None)
-def test_the_way_depends_on_the_number_of_spikes_alone(spikes):
-    places = [[-1.0, 0.0], [-0.6, 0.1], [-0.2, 0.9], [0.1, 2.2], [0.5, 1.6], [0.9, 3.9]]
-    together = steps(Line(places, 30.0), [1] * sum(spikes) or [0])[-1]
-    apart = steps(Line(places, 30.0), spikes)[-1]
-    torch.testing.assert_close(apart, together, rtol=0, atol=1e-5)
-
-
-def test_the_end_of_a_walk_is_held():
-    memory = Line([[0.0, 1.0], [0.1, 1.0]], pace=50.0)
-    seen = steps(memory, [100, 100, 100])
-    torch.testing.assert_close(seen, torch.tensor([0.1, 7.0, 1.0]).expand(3, 3))
-
-
-def test_the_recalls_of_a_step_are_bounded():
-    memory = Line([[-1.0 + 0.01 * i, 0.0] for i in range(100)], pace=1.0)
-    first = steps(memory, [1000])[-1]
-    assert memory.recalls == RECALLS_A_STEP
-    assert first[0] == pytest.approx(-1.0 + 0.01 * RECALLS_A_STEP)
+def test_a_course_is_joined_at_its_nearest_point():
+    for point in range(4):
+        way = course()
+        way.join(POINTS[point] + [0.1, -0.1], np.array([1.0, 1.0]))
+        assert way.done == SPIKES[point]
+    way = course()  # in shares of the joints' spans: the second joint hardly counts
+    way.join(np.array([0.9, 100.0]), np.array([1.0, 1e6]))
+    assert way.done == SPIKES[1]
 
 
 vectors = st.lists(st.floats(-10, 10, width=32), min_size=3, max_size=3).map(torch.tensor)
@@ -85,3 +76,37 @@ def test_limit_speed_shortens_a_step_to_the_limits(before, after, period):
         # and it points where the step pointed
         share = (moved * wanted).sum() / (wanted * wanted).sum()
         torch.testing.assert_close(moved, share * wanted, rtol=0, atol=1e-5)
+
+
+BASE = base_indices(make_body(2, base=True))
+
+
+@given(yaw=st.floats(-7, 7), seed=st.integers(0, 99))
+@settings(max_examples=30, deadline=None)
+def test_a_displacement_is_seen_from_the_base(yaw, seed):
+    world = np.random.default_rng(seed).normal(size=(4, 5))
+    seen = into_base(world, yaw, BASE)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    np.testing.assert_allclose(seen[:, 2:4] @ turn.T, world[:, 2:4], atol=1e-9)
+    np.testing.assert_array_equal(seen[:, [0, 1, 4]], world[:, [0, 1, 4]])
+    np.testing.assert_allclose(out_of_base(seen, yaw, BASE), world, atol=1e-9)
+    each = into_base(world, np.full(4, yaw), BASE)
+    np.testing.assert_allclose(each, seen)
+
+
+def test_forwards_is_forwards_whichever_way_the_base_looks():
+    ahead = np.array([0.0, 0.0, 0.1, 0.0, 0.0])
+    np.testing.assert_allclose(out_of_base(ahead, np.pi / 2, BASE), [0, 0, 0, 0.1, 0], atol=1e-12)
+    assert BASE == [2, 3, 4]
+
+
+def test_a_robot_that_stands_still_has_no_base():
+    assert base_indices(make_body(2)) == []
+    displacement = np.ones(2)
+    assert into_base(displacement, 1.0, []) is displacement
+
+
+def test_without_spikes_nothing_moves():
+    here, rest = course().advance(np.array([3.0, 4.0]), 0.0)
+    np.testing.assert_array_equal(here, [3.0, 4.0])
+    assert rest == 0.0

@@ -1,28 +1,26 @@
 """The figures of the grasp experiment and the human who guides it."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from hasm_torch.evaluation.grasp import (
-    GRASP_PATCH,
-    LIFT_NOISE_SHARE,
-    REACH_PATCH,
     SOFT_PATIENCE,
     STALLED_AFTER,
     TIME_LIMIT,
     GraspCase,
     Guide,
     cases,
-    noisy_start,
     run_case,
     summarise,
 )
-from hasm_torch.evaluation.rollout import roll_out
+from hasm_torch.evaluation.rollout import Human, roll_out
+from hasm_torch.robot import JOINTS
+from hasm_torch.sim.env import TouchPoint
+from hasm_torch.sim.tasks import GRASP_PATCH, LIFT_NOISE_SHARE, REACH_PATCH, noisy_start
 
 PERIOD = 0.02
-LOWER, UPPER = np.full(3, -1.0), np.full(3, 1.0)
+LOWER, UPPER = np.full(len(JOINTS), -1.0), np.full(len(JOINTS), 1.0)
+HOME = np.zeros(len(JOINTS))
 
 
 def guided(guide: Guide, speed: float, seconds: float = TIME_LIMIT + 5, stuck_after: float = 1.0):
@@ -32,7 +30,7 @@ def guided(guide: Guide, speed: float, seconds: float = TIME_LIMIT + 5, stuck_af
         time = step * PERIOD
         if guide.finished(time, state):
             break
-        patch, force = guide.touch(time, state)
+        patch, (force, _) = next(iter(guide.touches(time, state).items()), (None, (0.0, None)))
         seen.append((time, patch, force))
         if patch is not None and moved[patch] < stuck_after:
             moved[patch] += PERIOD
@@ -83,55 +81,66 @@ def test_patience_ends():
 
 def test_start_noise_has_its_size_and_keeps_the_limits():
     rng = np.random.default_rng(0)
-    starts = np.array([noisy_start(np.zeros(3), 0.05, LOWER, UPPER, rng) for _ in range(2000)])
-    np.testing.assert_allclose(starts.std(axis=0), 0.05 * np.array([LIFT_NOISE_SHARE, 1, 1]), 0.1)
-    wild = np.array([noisy_start(np.zeros(3), 50.0, LOWER, UPPER, rng) for _ in range(50)])
+    starts = np.array([noisy_start(HOME, 0.05, LOWER, UPPER, rng) for _ in range(2000)])
+    expected = 0.05 * np.array([LIFT_NOISE_SHARE, *[1.0] * 7, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(starts.std(axis=0), expected, rtol=0.1)
+    wild = np.array([noisy_start(HOME, 50.0, LOWER, UPPER, rng) for _ in range(50)])
     assert (wild >= LOWER).all()
     assert (wild <= UPPER).all()
     np.testing.assert_array_equal(noisy_start(UPPER, 0.0, LOWER, UPPER, rng), UPPER)
 
 
 def test_cases_are_planned_from_the_seed():
-    planned = cases(5, [4.0, 8.0], 1, pauses=2, start_noise=0.1, object_noise=0.01)
-    assert planned == cases(5, [4.0, 8.0], 1, 2, 0.1, 0.01)
+    planned = cases(5, 1, [4.0, 8.0], pauses=2, start_noise=0.1)
+    assert planned == cases(5, 1, [4.0, 8.0], pauses=2, start_noise=0.1)
     assert [case.force for case in planned] == [4.0, 8.0, 4.0, 8.0, 4.0]
     assert len({case.seed for case in planned}) == 5
-    assert [case.force for case in cases(2, [], 1, 2, 0.1, 0.01)] == [None, None]
+    assert all(3.0 <= case.force <= 12.0 for case in cases(20, 1))
+    far = np.array([case.place for case in cases(200, 1, object_noise=0.1)])
+    assert 0.09 < np.abs(far).max() <= 0.1
 
 
 class Table:
-    """A robot of three joints that reaches each target at once; the object rises with joint 0."""
+    """A robot that reaches each target at once; the object rises as it is told."""
 
     joint_lower, joint_upper = LOWER, UPPER
-    joint_speed_limit = np.full(3, 100.0)
-    skin_forces = np.zeros((1, 3))
+    joint_speed_limit = np.full(len(JOINTS), 100.0)
+    object_position = np.array([0.7, 0.1, 0.5])
 
     def __init__(self, drift: float = 0.0, lift: float = 0.1, success: bool = True) -> None:
         self.unwrapped, self.drift, self.lift, self.success = self, drift, lift, success
 
     def reset(self, seed, options):
-        self.steps, self.state, self.patch = 0, np.array(options["joints"]), None
+        self.steps, self.joint_position, self.touched = 0, np.array(options["joints"]), {}
         self.offset = options["object"]
         return self.observe(), {"time": 0.0}
 
-    def touch(self, patch, force):
-        self.patch, self.force = patch, force
+    def touch_all(self, touches):
+        self.touched = touches
+
+    def touch_points(self):
+        return [
+            TouchPoint(patch, cell, np.array([0.0, 0.0, -force]), np.zeros(3))
+            for patch, (force, cell) in self.touched.items()
+        ]
+
+    def block(self, joints):
+        self.blocked = joints
 
     def step(self, target):
         self.steps += 1
-        before, self.state = self.state, np.clip(target + self.drift, LOWER, UPPER)
-        self.joint_velocity = (self.state - before) / PERIOD
+        before, self.joint_position = self.joint_position, np.clip(target + self.drift, -1.0, 1.0)
+        self.joint_velocity = (self.joint_position - before) / PERIOD
         info = {
             "time": self.steps * PERIOD,
             "is_success": self.success,
-            "finger_force": self.force if self.patch else 0.0,
-            "touched": self.patch,
             "object_height": self.lift,
         }
         return self.observe(), 0.0, False, False, info
 
     def observe(self):
-        return {"state": self.state.astype(np.float32), "tactile": np.zeros(3, np.float32)}
+        seen = {"state": self.joint_position, "tactile": np.zeros(3), "environment_state": HOME[:3]}
+        return {name: values.astype(np.float32) for name, values in seen.items()}
 
 
 class Holder:
@@ -140,26 +149,28 @@ class Holder:
     def reset(self):
         self.resets = getattr(self, "resets", 0) + 1
 
-    def step(self, state, skin):
+    def step(self, state, skin, *, observation):
+        assert observation.shape == (3,)
         return state.clone()
 
 
-CASE = GraspCase(seed=3, pauses=2, start_noise=0.05, object_noise=0.01, force=6.0)
+CASE = GraspCase(seed=3, force=6.0, place=(0.004, -0.003), pauses=2)
 
 
 def test_a_robot_that_holds_still_does_not_drift():
     policy = Holder()
-    trace, found = run_case(CASE, Table(), policy, np.zeros(3))
+    trace, found = run_case(CASE, Table(), policy)
     assert found["success"]
     assert found["hold_drift"] == 0.0
     assert found["force"] == 6.0
     assert found["violations"] == 0
     assert policy.resets == 1
-    assert set(trace.patch) == {None, REACH_PATCH, GRASP_PATCH}
+    assert set(trace.patch[:, 0]) == {"", REACH_PATCH, GRASP_PATCH}
+    assert set(trace.patch[:, 1]) == {""}
 
 
 def test_a_robot_that_moves_in_a_pause_drifts():
-    trace, found = run_case(CASE, Table(drift=1e-4), Holder(), np.zeros(3))
+    trace, found = run_case(CASE, Table(drift=1e-4), Holder())
     longest = max(
         np.ptp(trace.time[(trace.time >= a + 0.3) & (trace.time <= b)]) for a, b in pauses_of(trace)
     )
@@ -168,7 +179,7 @@ def test_a_robot_that_moves_in_a_pause_drifts():
 
 def pauses_of(trace):
     """Spells without touch after the first touch, as (begin, end)."""
-    free = np.array([patch is None for patch in trace.patch])
+    free = trace.patch[:, 0] == ""
     edges = np.flatnonzero(np.diff(free.astype(int)))
     times = trace.time[edges]
     spans = zip(times[1::2], [*times[2::2], trace.time[-1]])
@@ -176,28 +187,52 @@ def pauses_of(trace):
 
 
 def test_success_needs_the_environment_and_the_height():
-    assert not run_case(CASE, Table(lift=0.04), Holder(), np.zeros(3))[1]["success"]
-    assert not run_case(CASE, Table(success=False), Holder(), np.zeros(3))[1]["success"]
+    assert not run_case(CASE, Table(lift=0.04), Holder())[1]["success"]
+    assert not run_case(CASE, Table(success=False), Holder())[1]["success"]
 
 
 def test_a_rollout_hands_on_what_the_case_says():
-    table = Table()
-    human = SimpleNamespace(touch=lambda t, s: (None, 0.0), finished=lambda t, s: t >= 0.1)
-    seen = []
-    trace = roll_out(table, Holder(), human, np.array([0.1, 0.2, 0.3]), 0, (0.004, -0.003),
-                     watch=seen.append)  # fmt: skip
-    assert table.offset == (0.004, -0.003)
-    np.testing.assert_allclose(trace.state, np.tile([0.1, 0.2, 0.3], (5, 1)), atol=1e-7)
+    class Two(Human):
+        def touches(self, time, state):
+            return {"wrist_left": (3.0, 2), "hand": (1.0, None)} if time < 0.05 else {}
+
+        def holds(self, time):
+            return ["odom_x"]
+
+        def finished(self, time, state):
+            return time >= 0.1
+
+    table, seen = Table(), []
+    start = np.linspace(0.0, 1.0, len(JOINTS))
+    place = (0.004, -0.003)
+    trace = roll_out(table, Holder(), Two(), start, 0, place, lambda: seen.append(table.steps))
+    assert table.offset == place
+    assert table.blocked == ["odom_x"]
+    assert seen == [1, 2, 3, 4, 5]
+    np.testing.assert_allclose(trace.state, np.tile(start, (5, 1)), atol=1e-7)
     np.testing.assert_allclose(trace.time, PERIOD * np.arange(1, 6))
-    assert len(seen) == 5
+    np.testing.assert_allclose(trace.strength, [4.0, 4.0, 4.0, 0.0, 0.0])
+    assert trace.patch[:3].tolist() == [["wrist_left", "hand"]] * 3
+    assert trace.cell[[0, 4]].tolist() == [[2, -1], [-1, -1]]
+    np.testing.assert_allclose(trace.force[0], [[0, 0, -3.0], [0, 0, -1.0]])
+    assert np.isnan(trace.point[4]).all()
+    np.testing.assert_allclose(trace.object[0], table.object_position)
 
 
 def test_figures_of_many_grasps_are_put_together():
     one = {"success": True, "hold_drift": 0.001, "violations": 0, "seconds": 10.0}
     two = {"success": False, "hold_drift": 0.004, "violations": 2, "seconds": 20.0}
-    summary = summarise([one, one, one, two])
+    summary = summarise([one, one, one, two], {})
     assert summary["rollouts"] == 4
     assert summary["success_rate"] == 0.75
     assert summary["hold_drift_rad"] == 0.004
     assert summary["limit_violations"] == 2
     assert summary["mean_seconds"] == 12.5
+
+
+def test_moved_objects_are_counted_by_largest_offset():
+    near = [{"success": True, "place": [0.01, 0.02]}, {"success": False, "place": [-0.02, 0.0]}]
+    rest = {"hold_drift": 0.0, "violations": 0, "seconds": 9.0}
+    summary = summarise([near[0] | rest], {"0.02": near, "0.10": near[:1]})
+    assert summary["moved"] == {"0.02": 0.5, "0.10": 1.0}
+    assert summary["moved_results"]["0.02"] == [[0.01, 0.02, 1.0], [-0.02, 0.0, 0.0]]

@@ -1,6 +1,5 @@
 """The neural baselines learn, hold out what they say, keep the limits and repeat themselves."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -9,19 +8,15 @@ import pytest
 import torch
 from toys import limits, make_body, press
 
-from benchmarks.baselines.demonstrations import Series, series_of
-from benchmarks.baselines.learned import Outcome, Scaling, act, diffusion
+from benchmarks.baselines.demonstrations import Sensed, Series, Units
+from benchmarks.baselines.learned import ACT, DIFFUSION, ChunkPolicy, Kind, Scaling
 from benchmarks.baselines.learned_training import Span, Training, gather, split
 from hasm_torch.body import Body
-from hasm_torch.data.episodes import Episode
+from hasm_torch.episode import Episode
 
-Train = Callable[..., Outcome]
 SPAN = Span(-2, 15)
 SHORT = Training(seconds=60.0, steps=24, every=12, batch=16, learning_rate=4e-3, average=0.5)
-CONTESTANTS = [
-    pytest.param(act, id="act"),
-    pytest.param(diffusion, id="diffusion"),
-]
+KINDS = [pytest.param(ACT, id="act"), pytest.param(DIFFUSION, id="diffusion")]
 
 
 @pytest.fixture(autouse=True)
@@ -48,19 +43,20 @@ def episodes(body: Body, forces=(6.0, 12.0, 9.0), rest: int = 10) -> list[Episod
 
 
 @cache
-def trained(train: Train, experiment: str) -> Outcome:
+def trained(kind: Kind, experiment: str) -> ChunkPolicy:
     """A policy of each kind, trained once."""
     body = make_body()
-    return train(experiment, body, episodes(body), SHORT)
+    return ChunkPolicy(kind, experiment, body, episodes(body), SHORT)
 
 
 def plain(task: str, samples: int) -> Series:
-    return Series(task, *[torch.zeros(samples, 1)] * 3)
+    return Series(task, *[torch.zeros(samples, 1)] * 4)
 
 
-@pytest.mark.parametrize("train", CONTESTANTS)
-def test_training_lowers_the_held_out_loss(train):
-    policy, notes = trained(train, "compliance")
+@pytest.mark.parametrize("kind", KINDS)
+def test_training_lowers_the_held_out_loss(kind):
+    policy = trained(kind, "compliance")
+    notes = policy.notes
     losses = [loss for _, loss in notes["held_out_curve"]]
     assert notes["stopped"] == "steps"
     assert notes["steps"] == SHORT.steps
@@ -72,7 +68,7 @@ def test_training_lowers_the_held_out_loss(train):
 def test_training_stops_when_the_held_out_loss_does_not_fall():
     body = make_body()
     still = replace(SHORT, learning_rate=1e-9, every=2, patience=2, steps=1000)
-    _, notes = act("compliance", body, episodes(body), still)
+    notes = ChunkPolicy(ACT, "compliance", body, episodes(body), still).notes
     assert notes["stopped"] == "patience"
     assert notes["steps"] < 20
 
@@ -104,7 +100,7 @@ def test_episodes_too_short_to_hold_out_are_refused():
 @pytest.mark.parametrize("mode", ["absolute", "increment"])
 def test_predictions_return_to_the_commands_of_the_episodes(mode):
     body = make_body()
-    series = [series_of(episode, body) for episode in episodes(body)]
+    series = [Units(body).series(episode) for episode in episodes(body)]
     windows, _ = gather(series, 1, Span(0, 19), body.rate)
     scaling = Scaling(windows, mode)
     action = scaling.batch(windows)["action"]
@@ -117,22 +113,22 @@ def test_predictions_return_to_the_commands_of_the_episodes(mode):
 
 def test_what_never_changes_is_not_seen():
     body = make_body()
-    series = [series_of(episode, body) for episode in episodes(body)]
+    series = [Units(body).series(episode) for episode in episodes(body)]
     windows, _ = gather(series, 1, Span(0, 19), body.rate)
     scaling = Scaling(windows, "increment")
-    state, touch = torch.rand(5, 3), 10 * torch.rand(5, 3)
-    seen = scaling.observation(state, touch)
+    state, touch = torch.rand(5, 3), 10 * torch.rand(5, 6)
+    seen = scaling.observation(Sensed(state, touch, torch.zeros(5, 0)))
     assert not seen["observation.state"][:, 1:].any()
-    assert not seen["observation.environment_state"][:, 2].any()
+    assert not seen["observation.environment_state"][:, 2].any(), "nobody touches the back"
     assert seen["observation.state"][:, 0].all()
     assert seen["observation.environment_state"][:, :2].all()
 
 
-@pytest.mark.parametrize("train", CONTESTANTS)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("experiment", ["compliance", "grasp"])
-def test_targets_keep_the_limits_and_what_no_episode_moves(train, experiment):
+def test_targets_keep_the_limits_and_what_no_episode_moves(kind, experiment):
     body = make_body()
-    policy, _ = trained(train, experiment)
+    policy = trained(kind, experiment)
     lower, upper = limits(body)
     for edge in (lower, upper):
         policy.reset()
@@ -148,10 +144,10 @@ def test_targets_keep_the_limits_and_what_no_episode_moves(train, experiment):
             state = target
 
 
-@pytest.mark.parametrize("train", CONTESTANTS)
-def test_reset_forgets_the_chunk(train):
+@pytest.mark.parametrize("kind", KINDS)
+def test_reset_forgets_the_chunk(kind):
     body = make_body()
-    policy, _ = trained(train, "grasp")
+    policy = trained(kind, "grasp")
     skin = press(body, "front", 6.0)
 
     def rollout(steps: int) -> torch.Tensor:
@@ -165,15 +161,16 @@ def test_reset_forgets_the_chunk(train):
         torch.testing.assert_close(rollout(15), whole, atol=0, rtol=0)
 
 
-@pytest.mark.parametrize("train", CONTESTANTS)
-def test_a_seed_decides_everything(train):
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_seed_decides_everything(kind):
     body = make_body()
     few, skin = episodes(body, forces=(12.0, 12.0, 12.0)), press(body, "side", 6.0)
     runs = []
     for seed in (0, 0, 1):
         torch.manual_seed(100 + len(runs))
-        policy, notes = train("grasp", body, few, replace(SHORT, steps=4, every=2, seed=seed))
-        losses = [loss for _, loss in notes["held_out_curve"]]
+        training = replace(SHORT, steps=4, every=2, seed=seed)
+        policy = ChunkPolicy(kind, "grasp", body, few, training)
+        losses = [loss for _, loss in policy.notes["held_out_curve"]]
         targets = torch.stack([policy.step(torch.zeros(3), skin)[0] for _ in range(12)])
         runs.append(np.concatenate([losses, targets.numpy()]))
     # Sums over memory that lies elsewhere may round otherwise.
@@ -184,11 +181,11 @@ def test_a_seed_decides_everything(train):
 def test_training_leaves_the_global_generator_alone():
     body = make_body()
     before = torch.random.get_rng_state()
-    act("compliance", body, episodes(body), replace(SHORT, steps=2))
+    ChunkPolicy(ACT, "compliance", body, episodes(body), replace(SHORT, steps=2))
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
 def test_unknown_experiments_are_named():
     body = make_body()
-    with pytest.raises(ValueError, match="valid: compliance, grasp"):
-        act("juggling", body, episodes(body), SHORT)
+    with pytest.raises(ValueError, match="valid: compliance, yield, grasp"):
+        ChunkPolicy(ACT, "juggling", body, episodes(body), SHORT)

@@ -3,17 +3,23 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
+from lerobot.configs import FeatureType
 from lerobot.envs import EnvConfig
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
+from hasm_torch.episode import ENVIRONMENT
 from hasm_torch.lerobot.env_hsr_touch import GYM_ID, TASKS, HSRTouchConfig
 from hasm_torch.lerobot.human_env import HumanTouchEnv
 from hasm_torch.robot import JOINTS
+from hasm_torch.sim.teacher import ComplianceTeacher, GraspTeacher, YieldTeacher
 
 JOINT = {"arm": JOINTS.index("arm_flex_joint"), "wrist": JOINTS.index("wrist_roll_joint")}
 RIGHT_WAY = {"arm_down": -1, "arm_up": 1, "wrist_left": 1, "wrist_right": -1}
+LAWS = {"arm_down": ComplianceTeacher, "yield": YieldTeacher, "torso": YieldTeacher,
+        "grasp": GraspTeacher}  # fmt: skip
 
 
 def run(env, turned=0, way=0, other=0.0, seed=0):
@@ -36,7 +42,37 @@ def run(env, turned=0, way=0, other=0.0, seed=0):
     return infos, reward
 
 
-@pytest.mark.parametrize("task", ["wrist_left", "grasp"])
+def follow(env, law, seed):
+    """Roll a teaching law out; the infos of all steps."""
+    observation, info = env.reset(seed=seed)
+    law.reset()
+    infos, ended = [info], False
+    while not ended:
+        state, skin = (
+            torch.from_numpy(observation["state"]),
+            torch.from_numpy(observation["tactile"]),
+        )
+        observation, _, ended, _, info = env.step(law.step(state, skin).numpy())
+        infos.append(info)
+    return infos
+
+
+@pytest.mark.parametrize(
+    ("task", "seeds"), [("arm_down", 2), ("yield", 4), ("torso", 2), ("grasp", 1)]
+)
+def test_a_law_that_was_taught_succeeds_and_holding_still_does_not(task, seeds):
+    env = HumanTouchEnv(task)
+    law = LAWS[task](env.sim)
+    for seed in range(seeds):
+        infos = follow(env, law, seed)
+        assert infos[-1]["is_success"]
+        assert len(infos) <= env._max_episode_steps
+        assert max(info["finger_force"] for info in infos) > 1.0
+    if task != "grasp":
+        assert not run(env, seed=0)[0][-1]["is_success"]
+
+
+@pytest.mark.parametrize("task", ["wrist_left", "yield", "grasp"])
 def test_gymnasium_finds_no_fault(task):
     check_env(gym.make(GYM_ID, task=task).unwrapped, skip_render_check=True)
 
@@ -73,7 +109,7 @@ def test_seed_decides_the_episode():
     assert np.array_equal(start(env, 3), start(other, 3))
     assert not np.array_equal(start(env, 3), start(env, 4))
     first = start(env, 3)
-    env.step(env.action_space.low)
+    env.step(first[:-1])
     assert not np.array_equal(start(env, None), first)
 
 
@@ -130,9 +166,22 @@ def test_lerobot_makes_it_and_reads_its_observations():
     for key, name in (("observation.state", "state"), ("observation.tactile", "tactile")):
         assert read[key].shape == (2, *features[key].shape)
         assert np.array_equal(read[key][1].numpy(), alone[name])
-    assert env.call("_max_episode_steps") == (151, 151)
+    assert env.call("_max_episode_steps") == (131, 131)
     assert env.call("task_description")[0] == "turn the wrist at its right side"
     env.close()
+
+
+def test_a_grasp_also_observes_the_object():
+    features = env_to_policy_features(HSRTouchConfig(task="grasp"))
+    assert (features[ENVIRONMENT].type, features[ENVIRONMENT].shape) == (FeatureType.ENV, (3,))
+    env = HumanTouchEnv("grasp")
+    observation, _ = env.reset(seed=0)
+    read = preprocess_observation(observation)
+    assert set(read) == {key for key in features if key != "action"}
+    place = read[ENVIRONMENT][0].numpy()  # the base stands at the origin of odom
+    np.testing.assert_allclose(place, env.sim.object_position, atol=1e-5)
+    other, _ = env.reset(seed=1)
+    assert np.abs(other["environment_state"] - place)[:2].max() > 1e-3
 
 
 def test_separate_processes_agree_with_one_process():

@@ -302,7 +302,8 @@ def test_not_finite_names_feature_episode_and_frame(broken, key, value):
 
 
 def test_mis_shaped_feature(broken):
-    edit_info(broken, lambda info: info["features"]["observation.state"].update(shape=[5]))
+    other = feature([5])
+    edit_info(broken, lambda info: info["features"].update({"observation.state": other}))
     with pytest.raises(ValueError, match=r"observation.state.*expected shape \(5,\).*got \(2,\)"):
         load_episodes(broken)
 
@@ -337,9 +338,10 @@ def test_column_declared_but_not_there(broken):
         load_episodes(broken)
 
 
-@pytest.mark.parametrize("frames", [0, sum(LENGTHS) - 2])
-def test_fewer_frames_than_the_episodes_need(broken, frames):
-    pq.write_table(pq.read_table(broken / DATA).slice(0, frames), broken / DATA)
+@pytest.mark.parametrize("frames", [0, sum(LENGTHS) - 2, sum(LENGTHS) + 3])
+def test_fewer_or_more_frames_than_the_episodes_need(broken, frames):
+    table = pq.read_table(broken / DATA)
+    pq.write_table(pa.concat_tables([table, table]).slice(0, frames), broken / DATA)
     with pytest.raises(ValueError, match=f"Expected 12 frames .* got {frames}"):
         load_episodes(broken)
 

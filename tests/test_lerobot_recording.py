@@ -11,6 +11,8 @@ import pytest
 
 from hasm_torch.data import (
     Episode,
+    EpisodeStream,
+    FeatureMap,
     SkinPatch,
     load_episodes,
     skin_patches,
@@ -105,6 +107,44 @@ def test_without_skin_and_with_one_joint(tmp_path):
     data = load_episodes(tmp_path / "set")
     assert data.skin is None
     np.testing.assert_array_equal(data.episodes[2].action, written[2].action)
+
+
+BOUND = {"observation.environment_state": {"x": "m", "y": "m"}, "observation.load": ["grams"]}
+
+
+def with_observations() -> list[Episode]:
+    rng = np.random.default_rng(2)
+    sizes = [(e, (len(e), 3)) for e in episodes()]
+    return [replace(e, observations=rng.normal(size=n).astype(np.float32)) for e, n in sizes]
+
+
+def test_further_observations(tmp_path):
+    written = with_observations()
+    folder = record(tmp_path / "set", iter(written), observations=BOUND)
+    data, stream = load_episodes(folder), EpisodeStream(folder)
+    assert data.observations == stream.observations == {k: len(v) for k, v in BOUND.items()}
+    for whole, streamed, mine in zip(data, stream, written, strict=True):
+        np.testing.assert_array_equal(whole.observations, mine.observations)
+        np.testing.assert_array_equal(streamed.observations, mine.observations)
+    features = read(folder).features
+    assert features["observation.load"]["info"] == {"bind": True, "units": ["unknown"]}
+    environment = features["observation.environment_state"]
+    assert (environment["names"], environment["info"]["units"]) == (["x", "y"], ["m", "m"])
+    frame = read(folder)[7]["observation.environment_state"]
+    np.testing.assert_array_equal(frame, written[2].observations[0, :2])
+
+
+def test_which_observations_are_bound_can_be_named(tmp_path):
+    folder = record(tmp_path / "set", with_observations(), observations=BOUND)
+    none = load_episodes(folder, FeatureMap(bound=[]))
+    assert none.observations == {}
+    assert none.episodes[0].observations is None
+    one = load_episodes(folder, FeatureMap(bound=["observation.load"]))
+    assert one.observations == {"observation.load": 1}
+    expected = with_observations()[2].observations[:, 2:]
+    np.testing.assert_array_equal(one.episodes[2].observations, expected)
+    with pytest.raises(ValueError, match=r"Expected a feature 'observation.lode' in"):
+        load_episodes(folder, FeatureMap(bound=["observation.lode"]))
 
 
 def test_lerobot_reads_the_same_frames(root):
@@ -230,8 +270,11 @@ def change(**values):
         (change(state=np.full((6, 3), 1e39)), {}, "finite numbers in 'observation.state', got inf"),
         (change(tactile=np.full((6, 5, 3), np.inf)), {}, "finite numbers in 'observation.tactile'"),
         (change(tactile=np.zeros((6, 15))), {}, "tactile of shape"),
-        (change(tactile=None), {}, "got tactile missing and skin given"),
-        (episodes(), {"skin": None}, "got tactile given and skin missing"),
+        (change(tactile=None), {}, "got tactile missing and their description given"),
+        (episodes(), {"skin": None}, "got tactile given and their description missing"),
+        (change(observations=np.zeros((6, 3))), {}, "got observations given and .* missing"),
+        (episodes(), {"observations": BOUND}, "got observations missing and .* given"),
+        (change(observations=np.zeros((6, 2))), {"observations": BOUND}, "got \\(6, 2\\)"),
         (change(time=np.arange(6) / 30), {}, "6 time stamps 0.02 s apart"),
         (change(time=np.arange(5) / FPS), {}, "6 time stamps"),
         (change(task=""), {}, "task in words"),

@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 from hasm_torch.apps.record import EnvSource, RecordConfig, main, record
 from hasm_torch.data import load_episodes
+from hasm_torch.episode import ENVIRONMENT
 
 
 class Pendulum(gymnasium.Env):
@@ -19,7 +20,7 @@ class Pendulum(gymnasium.Env):
     def __init__(self, speed: float = 0.1):
         box = spaces.Box(-np.inf, np.inf, (2,), np.float32)
         skin = spaces.Box(0, 100, (4,), np.float32)
-        self.observation_space = spaces.Dict({"joints": box, "pressure": skin})
+        self.observation_space = spaces.Dict({"joints": box, "pressure": skin, "load": box})
         self.action_space, self.speed = box, speed
 
     def reset(self, *, seed=None, options=None):
@@ -34,7 +35,8 @@ class Pendulum(gymnasium.Env):
         return self._see(), 0.0, self.steps == 7, False, {}
 
     def _see(self):
-        return {"joints": self.state, "pressure": np.full(4, self.steps, np.float32)}
+        pressure, load = np.full(4, self.steps, np.float32), 2 * self.state
+        return {"joints": self.state, "pressure": pressure, "load": load}
 
 
 gymnasium.register("hasm_torch_tests/Pendulum-v0", entry_point=Pendulum)
@@ -50,6 +52,7 @@ def test_records_any_environment(tmp_path):
         options={"speed": 0.2},
         state="joints",
         tactile="pressure",
+        observations=["load"],
         controller=f"{__name__}:lean",
     )
     config = RecordConfig(
@@ -72,10 +75,19 @@ def test_records_any_environment(tmp_path):
         np.testing.assert_allclose(episode.action, episode.state + 0.5, atol=1e-6)
         assert episode.tactile.shape == (7, 4, 1)
         assert episode.tactile[:, 0, 0].tolist() == list(range(7))
+        np.testing.assert_array_equal(episode.observations, 2 * episode.state)
+    assert data.observations == {"observation.load": 2}
+    config.root, config.env.observations = tmp_path / "other", ["lode"]
+    with pytest.raises(ValueError, match=r"'pressure'\], not 'lode': give --env.observations"):
+        record(config)
 
 
 def test_records_the_touched_hsr(tmp_path):
-    source = EnvSource(id="hasm_torch.sim:hasm_torch/HSRTouch-v0")
+    source = EnvSource(
+        id="hasm_torch.sim:hasm_torch/HSRTouch-v0",
+        options={"scene": "grasp"},
+        observations=["environment_state"],
+    )
     from hasm_torch.robot import JOINTS
 
     config = RecordConfig(root=tmp_path / "d", env=source, joints=list(JOINTS), max_steps=5)
@@ -83,19 +95,27 @@ def test_records_the_touched_hsr(tmp_path):
     assert data.fps == 50
     assert next(iter(data.skin)) == "wrist_upper"
     assert data.episodes[0].tactile.shape == (5, 54, 3)
+    assert data.observations == {ENVIRONMENT: 3}
+    assert 0.3 < data.episodes[0].observations[0, 0] < 1.5  # m, in front of the robot
 
 
 def test_records_arrays(tmp_path):
     rng = np.random.default_rng(0)
-    state, tactile = rng.normal(size=(9, 2)), rng.uniform(size=(9, 6))
+    state, tactile, place = rng.normal(size=(9, 2)), rng.uniform(size=(9, 6)), rng.random((9, 3))
     path = tmp_path / "a.npz"
-    np.savez(path, state=state, tactile=tactile, episode=[0] * 5 + [1] * 4)
+    series = {"state": state, "tactile": tactile, "observation.place": place}
+    np.savez(path, **series, episode=[0] * 5 + [1] * 4)
     config = RecordConfig(root=tmp_path / "d", arrays=path, joints=["a", "b"], fps=10)
     data = load_episodes(record(config))
     first, second = data.episodes
     np.testing.assert_allclose(first.state, state[:5], atol=1e-6)
     np.testing.assert_allclose(first.action, state[[1, 2, 3, 4, 4]], atol=1e-6)
     np.testing.assert_allclose(second.tactile, tactile[5:].reshape(4, 2, 3), atol=1e-6)
+    np.testing.assert_allclose(second.observations, place[5:], atol=1e-6)
+    assert data.observations == {"observation.place": 3}
+    np.savez(path, **series, place=place)
+    with pytest.raises(ValueError, match=r"expected state and what there is of .*, observation.<"):
+        record(config)
 
 
 @pytest.mark.parametrize(

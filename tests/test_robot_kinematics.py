@@ -10,9 +10,10 @@ import pytorch_kinematics
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from postures import anywhere
 
 from hasm_torch._assets import asset_path
-from hasm_torch.robot import JOINTS, Kinematics
+from hasm_torch.robot import BASE_FRAME, JOINTS, METRES, Kinematics
 from hasm_torch.robot.urdf import read_urdf
 
 REFERENCE = json.loads((Path(__file__).parent / "data" / "hsr_fk.json").read_text())
@@ -23,10 +24,20 @@ def hsr() -> Kinematics:
     return Kinematics()
 
 
-def random_positions(hsr: Kinematics, *shape: int, seed: int = 0) -> torch.Tensor:
+@pytest.fixture(scope="module")
+def springy() -> Kinematics:
+    """The HSR with the springs in its fingers, which the reference moves too."""
+    return Kinematics(joints=list(REFERENCE["configs"][0]["joints"]))
+
+
+def random_positions(*shape: int, seed: int = 0) -> torch.Tensor:
     """(*shape, J) joint positions within the limits."""
-    u = torch.rand(*shape, len(JOINTS), generator=torch.Generator().manual_seed(seed))
-    return hsr.lower + u.to(hsr.dtype) * (hsr.upper - hsr.lower)
+    return torch.from_numpy(anywhere(np.random.default_rng(seed), *shape))
+
+
+def posture(**positions: float) -> torch.Tensor:
+    """(J,) joint positions, 0 where not named."""
+    return torch.tensor([positions.get(name, 0.0) for name in JOINTS], dtype=torch.float64)
 
 
 def reference_poses(config: dict) -> dict[str, torch.Tensor]:
@@ -37,26 +48,20 @@ def reference_poses(config: dict) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("config", REFERENCE["configs"], ids=lambda c: c["name"])
-def test_matches_reference(hsr: Kinematics, config: dict) -> None:
-    poses = hsr.forward_named(config["joints"])
-    for link, expected in reference_poses(config).items():
-        torch.testing.assert_close(poses[link], expected, rtol=0, atol=1e-6, msg=link)
+def test_matches_reference(springy: Kinematics, config: dict) -> None:
+    """The reference's frame is that of the base, which stands at 0 there."""
+    q = torch.tensor([config["joints"][name] for name in springy.joints], dtype=torch.float64)
+    poses, expected = springy.forward(q), reference_poses(config)
     # float64 through and through: far below what float32 origins would leave.
-    worst = max((poses[n] - e).abs().max() for n, e in reference_poses(config).items())
-    assert worst < 1e-11
-
-
-@pytest.mark.parametrize("config", REFERENCE["configs"], ids=lambda c: c["name"])
-def test_joint_vector_equals_names_and_float32_is_close(hsr: Kinematics, config: dict) -> None:
-    q = torch.tensor([config["joints"][name] for name in JOINTS], dtype=torch.float64)
-    single = Kinematics(dtype=torch.float32).forward(q)
-    for link, expected in hsr.forward_named(config["joints"]).items():
-        torch.testing.assert_close(hsr.forward(q)[link], expected, rtol=0, atol=1e-14)
+    for link, pose in expected.items():
+        torch.testing.assert_close(poses[link], pose, rtol=0, atol=1e-11, msg=link)
+    single = Kinematics(joints=springy.joints, dtype=torch.float32).forward(q)
+    for link, pose in poses.items():
         assert single[link].dtype == torch.float32
-        torch.testing.assert_close(single[link].double(), expected, rtol=0, atol=2e-6)
+        torch.testing.assert_close(single[link].double(), pose, rtol=0, atol=2e-6)
 
 
-def test_matches_mujoco_at_100_random_positions(hsr: Kinematics) -> None:
+def test_matches_mujoco_at_100_random_positions() -> None:
     spec = mujoco.MjSpec.from_file(str(asset_path("hsr.urdf")))
     assert not spec.compiler.fusestatic
     assert not spec.compiler.discardvisual
@@ -64,11 +69,11 @@ def test_matches_mujoco_at_100_random_positions(hsr: Kinematics) -> None:
     data = mujoco.MjData(model)
     robot = read_urdf(asset_path("hsr.urdf"))
     rng = np.random.default_rng(0)
-    names = hsr.movable
-    lower = np.array([robot.joints[n].lower for n in names])
-    upper = np.array([robot.joints[n].upper for n in names])
-    samples = rng.uniform(lower, upper, size=(100, len(names)))
-    poses = hsr.forward_named({n: torch.from_numpy(samples[:, i]) for i, n in enumerate(names)})
+    moving = [j.name for j in robot.joints.values() if j.type != "fixed" and j.mimic is None]
+    names = [*JOINTS, *(name for name in moving if name not in JOINTS)]
+    springs = rng.uniform(0.0, 0.698, (100, len(names) - len(JOINTS)))
+    samples = np.hstack([anywhere(rng, 100), springs])
+    poses = Kinematics(joints=names).forward(torch.from_numpy(samples))
     worst = 0.0
     for row, sample in enumerate(samples):
         positions = dict(zip(names, sample))
@@ -79,7 +84,7 @@ def test_matches_mujoco_at_100_random_positions(hsr: Kinematics) -> None:
         for name, value in positions.items():
             data.qpos[model.joint(name).qposadr[0]] = value
         mujoco.mj_kinematics(model, data)
-        for link in hsr.links:
+        for link in robot.links:
             body, pose = data.body(link), poses[link][row].numpy()
             worst = max(worst, np.abs(body.xpos - pose[:3, 3]).max())
             worst = max(worst, np.abs(body.xmat.reshape(3, 3) - pose[:3, :3]).max())
@@ -90,7 +95,7 @@ def test_matches_the_librarys_own_urdf_reader(hsr: Kinematics) -> None:
     """Only float32 origins and the mimic rules set the two apart."""
     text = asset_path("hsr.urdf").read_bytes()
     chain = pytorch_kinematics.build_chain_from_urdf(text).to(dtype=torch.float64)
-    q = random_positions(hsr, 5)
+    q = random_positions(5)
     positions = dict.fromkeys(chain.get_joint_parameter_names(), torch.zeros_like(q[:, 0]))
     positions |= dict(zip(JOINTS, q.T))
     for name, joint in read_urdf(asset_path("hsr.urdf")).joints.items():
@@ -103,11 +108,10 @@ def test_matches_the_librarys_own_urdf_reader(hsr: Kinematics) -> None:
 
 
 def test_torso_and_fingers_follow(hsr: Kinematics) -> None:
-    rest = hsr.forward(torch.zeros(8))
-    lifted = hsr.forward_named({"arm_lift_joint": 0.6})
+    rest, lifted = hsr.forward(posture()), hsr.forward(posture(arm_lift_joint=0.6))
     for link, height in (("arm_lift_link", 0.6), ("torso_lift_link", 0.3), ("head_tilt_link", 0.3)):
         assert (lifted[link] - rest[link])[2, 3].item() == pytest.approx(height, abs=1e-12)
-    opened = hsr.forward_named({"hand_motor_joint": 1.0})
+    opened = hsr.forward(posture(hand_motor_joint=1.0))
     gap = [
         (p["hand_l_finger_tip_frame"] - p["hand_r_finger_tip_frame"])[:3, 3].norm().item()
         for p in (rest, opened)
@@ -116,15 +120,26 @@ def test_torso_and_fingers_follow(hsr: Kinematics) -> None:
     assert gap[1] > 0.1
 
 
-def test_root_is_the_base_frame(hsr: Kinematics) -> None:
-    pose = hsr.forward(random_positions(hsr, 3))["base_footprint"]
-    torch.testing.assert_close(pose, torch.eye(4, dtype=torch.float64).expand(3, 4, 4))
+def test_the_base_moves_all_and_is_left_out_in_its_own_frame(hsr: Kinematics) -> None:
+    q = random_positions(5)
+    still = q.clone()
+    still[:, -3:] = 0.0
+    moved, apart, rest = hsr.forward(q), hsr.forward(q, BASE_FRAME), hsr.forward(still)
+    x, y, t = q[:, -3:].T
+    zero, one = torch.zeros(5).double(), torch.ones(5).double()
+    rows = [[t.cos(), -t.sin(), zero, x], [t.sin(), t.cos(), zero, y], [zero, zero, one, zero]]
+    base = torch.stack([*(torch.stack(r, -1) for r in rows), torch.eye(4)[3].expand(5, 4)], 1)
+    torch.testing.assert_close(moved[BASE_FRAME], base)
+    for link in {*hsr.links} - {"odom", "odom_x_link", "odom_y_link"}:
+        torch.testing.assert_close(apart[link], rest[link])
+        torch.testing.assert_close(moved[link], base @ rest[link])
+        torch.testing.assert_close(hsr.pose(q, link, BASE_FRAME), apart[link])
 
 
 @settings(max_examples=15, deadline=None)
 @given(shape=st.lists(st.integers(0, 3), max_size=3), seed=st.integers(0, 1000))
 def test_any_batch_shape_equals_one_by_one(hsr: Kinematics, shape: list[int], seed: int) -> None:
-    q = random_positions(hsr, *shape, seed=seed)
+    q = random_positions(*shape, seed=seed)
     poses = hsr.forward(q)
     assert set(poses) == set(hsr.links)
     palm = poses["hand_palm_link"]
@@ -134,13 +149,8 @@ def test_any_batch_shape_equals_one_by_one(hsr: Kinematics, shape: list[int], se
         torch.testing.assert_close(palm[index], alone, rtol=0, atol=1e-13)
 
 
-def test_names_are_broadcast(hsr: Kinematics) -> None:
-    poses = hsr.forward_named({"arm_lift_joint": torch.rand(3, 1), "arm_flex_joint": torch.rand(4)})
-    assert poses["hand_palm_link"].shape == (3, 4, 4, 4)
-
-
 def test_rotations_stay_rotations(hsr: Kinematics) -> None:
-    for pose in hsr.forward(random_positions(hsr, 20)).values():
+    for pose in hsr.forward(random_positions(20)).values():
         rotation = pose[:, :3, :3]
         eye = torch.eye(3, dtype=torch.float64).expand_as(rotation)
         torch.testing.assert_close(rotation @ rotation.mT, eye, rtol=0, atol=1e-12)
@@ -154,37 +164,39 @@ def test_gradients_to_second_order(hsr: Kinematics) -> None:
         out = hsr.forward(q)
         return tuple(out[link] for link in links)
 
-    q = random_positions(hsr, 2).requires_grad_()
+    q = random_positions(2).requires_grad_()
     assert torch.autograd.gradcheck(poses, (q,))
     assert torch.autograd.gradgradcheck(lambda q: hsr.pose(q, "hand_palm_link"), (q[0],))
 
 
 def test_limits(hsr: Kinematics) -> None:
     assert hsr.joints == JOINTS
-    assert hsr.lower.tolist() == [0.0, -2.62, -2.09, -1.92, -1.92, -3.84, -1.57, -0.798]
-    assert hsr.upper.tolist() == [0.69, 0.0, 3.84, 1.22, 3.67, 1.75, 0.52, 1.24]
-    assert hsr.velocity.tolist() == [0.2, 1.2, 2.0, 1.5, 1.5, 1.0, 1.0, 1.0]
+    free = [float("inf")] * 3
+    least = [0.0, -2.62, -2.09, -1.92, -1.92, -3.84, -1.57, -0.798]
+    assert hsr.lower.tolist() == [*least, *(-end for end in free)]
+    assert hsr.upper.tolist() == [0.69, 0.0, 3.84, 1.22, 3.67, 1.75, 0.52, 1.24, *free]
+    assert hsr.velocity.tolist() == [0.2, 1.2, 2.0, 1.5, 1.5, 1.0, 1.0, 1.0, 0.2, 0.2, 1.0]
+    slide = [name for name in JOINTS if hsr.robot.joints[name].type == "prismatic"]
+    assert slide == list(METRES)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_rejects_what_is_not_finite(hsr: Kinematics, bad: float) -> None:
-    q = torch.zeros(2, 8)
+    q = torch.zeros(2, 11)
     q[1, 3] = bad
     with pytest.raises(ValueError, match="finite"):
         hsr.forward(q)
-    with pytest.raises(ValueError, match="finite"):
-        hsr.forward_named({"wrist_flex_joint": bad})
 
 
 def test_errors_name_what_is_valid(hsr: Kinematics) -> None:
     with pytest.raises(ValueError, match="wrist_roll_joint"):
-        hsr.forward(torch.zeros(7))
-    with pytest.raises(ValueError, match=r"valid joints are: .*hand_l_spring_proximal_joint"):
-        hsr.forward_named({"elbow": 0.0})
-    with pytest.raises(ValueError, match="follows 'arm_lift_joint'"):
-        hsr.forward_named({"torso_lift_joint": 0.1})
+        hsr.forward(torch.zeros(8))
+    with pytest.raises(ValueError, match=r"lacks the moving joints elbow; it has: odom_x"):
+        Kinematics(joints=["elbow"])
     with pytest.raises(ValueError, match=r"valid links are: .*hand_palm_link"):
-        hsr.pose(torch.zeros(8), "tail")
+        hsr.pose(posture(), "tail")
+    with pytest.raises(ValueError, match=r"valid links are: .*hand_palm_link"):
+        hsr.forward(posture(), frame="tail")
     with pytest.raises(ValueError, match="float16"):
         Kinematics(dtype=torch.float16)
     with pytest.raises(FileNotFoundError, match=r"hsr\.urdf"):
@@ -205,7 +217,6 @@ ARM = """<robot name="r"><link name="a"/><link name="b"/><link name="c"/>
         ({"leader": "k"}, "moves by itself; those are: j"),
         ({"kind": "fixed", "leader": "j"}, "moves by itself"),
         ({"child": "c"}, "one root link"),
-        ({}, "lacks the joints arm_lift_joint"),
     ],
 )
 def test_rejects_other_urdfs(tmp_path: Path, changes: dict[str, str], message: str) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from postures import LOWER, UPPER, anywhere
 
 import hasm_torch.sim  # registers the environment
 from hasm_torch.robot import JOINTS, PATCHES, Kinematics
@@ -27,7 +28,7 @@ def roll(env, seed, ticks=60):
     for tick in range(ticks):
         if tick % 15 == 0:
             env.touch(PATCHES[tick // 15], 6.0)
-            target = rng.uniform(env.joint_lower, env.joint_upper)
+            target = anywhere(rng)
         seen.append(env.step(target)[0])
     rows = [np.concatenate([o["state"], o["tactile"]]) for o in seen]
     return np.stack(rows), env.object_position
@@ -41,8 +42,9 @@ def test_gymnasium_accepts_the_environment(scene):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(env.unwrapped, skip_render_check=True)
-    # The action is a joint target in rad, not a number from -1 to 1.
-    assert [w for w in caught if "symmetric and normalized" not in str(w.message)] == []
+    # The action is a joint target in rad, not a number from -1 to 1, and the base has no limits.
+    expected = ("symmetric and normalized", "infinity. This is probably too")
+    assert [w for w in caught if not any(text in str(w.message) for text in expected)] == []
     env.close()
 
 
@@ -76,7 +78,7 @@ def test_links_are_where_the_kinematics_say(env):
     kinematics = Kinematics()
     rng = np.random.default_rng(1)
     for _ in range(5):
-        joints = rng.uniform(env.joint_lower, env.joint_upper)
+        joints = anywhere(rng)
         env.reset(seed=0, options={"joints": joints})
         poses = kinematics.forward(torch.from_numpy(env.joint_position))
         bodies = {env.model.body(i).name for i in range(env.model.nbody)}
@@ -91,7 +93,7 @@ def test_followers_keep_to_their_rule_while_everything_moves(env):
     rng = np.random.default_rng(2)
     env.reset(seed=0)
     for _ in range(6):
-        target = rng.uniform(env.joint_lower, env.joint_upper)
+        target = anywhere(rng)
         for _ in range(10):
             env.step(target)
             lift = env.data.joint("arm_lift_joint").qpos[0]
@@ -123,12 +125,12 @@ def test_positions_and_speeds_stay_within_limits(seed, monkeypatch):
 
     monkeypatch.setattr(mujoco, "mj_step", watched(mujoco.mj_step))
     monkeypatch.setattr(mujoco, "mj_step2", watched(mujoco.mj_step2))
-    env.reset(seed=seed, options={"joints": rng.uniform(env.joint_lower, env.joint_upper)})
+    env.reset(seed=seed, options={"joints": anywhere(rng)})
     for tick in range(600):
         if tick % 40 == 0:
-            ends = np.where(rng.random(len(JOINTS)) < 0.5, env.joint_lower, env.joint_upper)
-            anywhere = rng.uniform(env.joint_lower, env.joint_upper)
-            target = np.where(rng.random(len(JOINTS)) < 0.7, ends, anywhere)
+            ends = np.where(rng.random(len(JOINTS)) < 0.5, LOWER, UPPER)
+            inner = anywhere(rng)
+            target = np.where(rng.random(len(JOINTS)) < 0.7, ends, inner)
         if tick % 20 == 0:
             env.touch(*((rng.choice(PATCHES), rng.uniform(2, 14)) if tick % 60 else (None, 0.0)))
         observation, *_ = env.step(target)
@@ -136,11 +138,11 @@ def test_positions_and_speeds_stay_within_limits(seed, monkeypatch):
     assert len(inside) == 6000
     assert all(inside)
     assert (share <= 1.0).all()
-    assert (share > 0.9).sum() >= 5  # the limits were really put to the test
+    assert (share > 0.9).sum() >= 8  # the limits were really put to the test
 
 
 def test_targets_are_reached_and_held_against_gravity(env):
-    target = np.array([0.3, -1.3, 0.5, -0.6, -0.4, 0.3, -0.5, 0.9])
+    target = np.array([0.3, -1.3, 0.5, -0.6, -0.4, 0.3, -0.5, 0.9, 0.4, -0.3, 1.5])
     env.reset(seed=0)
     for _ in range(200):
         env.step(target)
@@ -151,13 +153,13 @@ def test_targets_are_reached_and_held_against_gravity(env):
 def test_targets_beyond_the_limits_are_clipped(env):
     env.reset(seed=0)
     for _ in range(300):
-        env.step(np.full(8, 100.0))
-    np.testing.assert_allclose(env.joint_position, env.joint_upper, atol=4e-3)
+        env.step(np.r_[np.full(8, 100.0), np.zeros(3)])
+    np.testing.assert_allclose(env.joint_position[:8], env.joint_upper[:8], atol=4e-3)
 
 
 def test_options_set_joints_and_object():
     env = HSRTouchEnv("grasp")
-    joints = np.array([0.1, -1.0, 0.2, -0.3, 0.4, 0.5, -0.6, 0.7])
+    joints = np.array([0.1, -1.0, 0.2, -0.3, 0.4, 0.5, -0.6, 0.7, 0.1, -0.2, 4.0])
     observation, info = env.reset(seed=0, options={"joints": joints, "object": (0.01, -0.02)})
     np.testing.assert_allclose(observation["state"], joints, atol=1e-6)
     moved = env.object_position
@@ -169,7 +171,7 @@ def test_options_set_joints_and_object():
 
 @pytest.mark.parametrize(
     "action",
-    [np.full(8, np.nan), np.r_[np.inf, np.zeros(7)], np.zeros(7), np.zeros((1, 8)), 0.0],
+    [np.full(11, np.nan), np.r_[np.inf, np.zeros(10)], np.zeros(8), np.zeros((1, 11)), 0.0],
 )
 def test_bad_actions_are_refused(env, action):
     env.reset(seed=0)
@@ -192,9 +194,9 @@ def test_bad_touches_are_refused(env):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"joint": np.zeros(8)}, "'joints' and 'object'"),
+        ({"joint": np.zeros(11)}, "'joints' and 'object'"),
         ({"joints": np.zeros(5)}, "joints must have shape"),
-        ({"joints": np.full(8, np.nan)}, "joints must be finite"),
+        ({"joints": np.full(11, np.nan)}, "joints must be finite"),
         ({"object": (0.0, np.inf)}, "object must be finite"),
     ],
 )

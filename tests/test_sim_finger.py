@@ -13,9 +13,9 @@ def env():
 
 
 def moving_targets(env, seconds, speed):
-    """Targets of a start posture and of all arm joints swaying at up to `speed` rad/s."""
-    middle = np.array([0.3, -1.2, 0.4, -0.4, 0.6, 0.0, -0.3, 0.6])
-    sway = np.array([0.0, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.0])
+    """Targets of a start posture and of arm and base swaying at up to `speed` rad/s."""
+    middle = np.array([0.3, -1.2, 0.4, -0.4, 0.6, 0.0, -0.3, 0.6, 0.0, 0.0, 0.0])
+    sway = np.array([0.0, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.0, 0.1, 0.1, 0.3])
     for tick in range(round(seconds * 50)):
         yield middle + sway * np.sin(speed / 0.3 * tick / 50)
 

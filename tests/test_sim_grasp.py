@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hasm_torch.sim import HSRTouchEnv
-from hasm_torch.sim.poses import GRASP_POSES, START_POSES
+from hasm_torch.sim.tasks import GRASP_POSES, START_POSES
 
 SECONDS = {"before": 3.0, "around": 1.5, "closed": 1.2, "lifted": 2.5}
 HAND = 7
@@ -18,8 +18,8 @@ def env():
 def grasp(env, seed, close=True, hold_where_closed=False):
     """Follows the poses one after the other; returns the last info."""
     rng = np.random.default_rng(seed)
-    spread = np.array([0.01, *[0.05] * 7])
-    start = np.array(START_POSES["grasp"]) + rng.uniform(-1, 1, 8) * spread
+    spread = np.array([0.01, *[0.05] * 7, 0.0, 0.0, 0.0])
+    start = np.array(START_POSES["grasp"]) + rng.uniform(-1, 1, 11) * spread
     options = {"joints": start, "object": rng.uniform(-0.01, 0.01, 2)}
     env.reset(seed=seed, options=options)
     place = env.object_position

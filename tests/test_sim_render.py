@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from hasm_torch.sim import HSRTouchEnv
-from hasm_torch.sim.render import SceneRenderer
+from hasm_torch.sim.render import EXTENTS, HEIGHT, WIDTH, SceneRenderer
+from hasm_torch.sim.tasks import START_POSES
 
 
 @pytest.fixture(params=["compliance", "grasp"])
@@ -53,6 +54,37 @@ def test_rendering_changes_nothing(env):
                 env.render()
         runs.append(np.concatenate([observation["state"], observation["tactile"]]))
     np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize("env", ["grasp"], indirect=True)
+@pytest.mark.parametrize(("camera", "axes"), [("top", [0, 1]), ("side", [0, 2])])
+def test_parallel_cameras_show_the_world_to_scale(env, camera, axes):
+    for base in ([0.0, 0.0, 0.0], [-0.3, -0.2, 0.5]):
+        joints = np.r_[START_POSES["grasp"][:8], base]
+        env.reset(seed=0, options={"joints": joints, "object": (0.05, 0.1)})
+        red, green, blue = env.render(camera).astype(int).transpose(2, 0, 1)
+        rows, columns = np.nonzero((red > 1.8 * green) & (red > 1.8 * blue) & (red > 100))
+        left, right, bottom, top = EXTENTS[camera]
+        found = [
+            left + (columns.mean() + 0.5) / WIDTH * (right - left),
+            top - (rows.mean() + 0.5) / HEIGHT * (top - bottom),
+        ]
+        np.testing.assert_allclose(found, env.object_position[axes], atol=0.006)
+
+
+def test_the_camera_that_follows_keeps_the_robot_in_view(env):
+    joints = np.r_[START_POSES[env.scene][:8], 0.0, 0.0, 0.0]
+    seen = []
+    for x, y in ((0.0, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.0, -0.8)):
+        joints[8:10] = x, y
+        env.reset(seed=0, options={"joints": joints})
+        env.touch("wrist_right", 10.0)
+        for _ in range(8):
+            env.step(joints)
+        seen.append(glowing(env.render()).sum())
+    assert min(seen) > 10
+    with pytest.raises(ValueError, match="'follow', 'top' or 'side', got 'front'"):
+        env.render("front")
 
 
 def test_closing_frees_the_renderer_and_may_be_repeated(env):

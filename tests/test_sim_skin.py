@@ -1,6 +1,7 @@
 import mujoco
 import numpy as np
 import pytest
+from postures import anywhere
 
 from hasm_torch.robot import PATCHES
 from hasm_torch.sim import HSRTouchEnv
@@ -71,7 +72,7 @@ def test_the_centre_of_pressure_is_where_the_finger_is(env):
 def test_untouched_skin_is_silent_in_any_posture(env):
     rng = np.random.default_rng(3)
     for _ in range(10):
-        joints = rng.uniform(env.joint_lower, env.joint_upper)
+        joints = anywhere(rng)
         observation, _ = env.reset(seed=0, options={"joints": joints})
         for _ in range(3):
             observation, _, _, _, info = env.step(joints)

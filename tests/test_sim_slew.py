@@ -4,6 +4,7 @@ from hypothesis import strategies as st
 
 from hasm_torch.sim.slew import SlewedReference
 
+LEAD = 0.03  # m or rad
 LOWER, UPPER = np.array([-1.0, 0.0]), np.array([2.0, 0.7])
 VELOCITY, ACCELERATION = np.array([1.2, 0.2]), np.array([9.0, 2.5])
 TICK, SUBSTEPS = 0.02, 10
@@ -67,8 +68,25 @@ def test_small_steps_are_followed_within_one_tick_of_rest():
 def test_the_reference_of_a_blocked_joint_waits_at_rest():
     slewed = reference([0.0, 0.1])
     for _ in range(30):
-        slewed.stay_near(np.array([0.0, slewed.position[1]]), lead=0.03)
+        slewed.stay_near(np.array([0.0, slewed.position[1]]))
         slewed.plan(np.array([2.0, 0.7]))
-    assert slewed.position[0] <= 0.03 + ACCELERATION[0] * TICK**2
+    assert slewed.position[0] <= LEAD + ACCELERATION[0] * TICK**2
     np.testing.assert_allclose(slewed.position[1], 0.2, atol=0.02)
     np.testing.assert_allclose(slewed.velocity[1], VELOCITY[1])
+
+
+def test_a_held_joint_brakes_as_fast_as_it_may_and_stays():
+    slewed = reference([0.0, 0.1])
+    for _ in range(20):
+        slewed.plan(np.array([2.0, 0.7]))
+    caught, speed = slewed.position.copy(), slewed.velocity[0]
+    braking = speed**2 / (2 * ACCELERATION[0])
+    for _ in range(30):
+        slewed.hold(np.array([True, False]))  # said again, it is the same place
+        slewed.plan(np.array([2.0, 0.7]))
+    np.testing.assert_allclose(slewed.position[0], caught[0] + braking, atol=1e-9)
+    np.testing.assert_allclose(slewed.velocity[0], 0, atol=1e-9)
+    assert slewed.position[1] > caught[1] + 0.1
+    slewed.hold(np.array([False, False]))
+    slewed.plan(np.array([2.0, 0.7]))
+    assert slewed.velocity[0] > 0.0

@@ -22,9 +22,9 @@ def felt(env, *patches):
 
 
 def swaying(ticks):
-    """Targets with which all arm joints sway at up to 0.5 rad/s."""
-    middle = np.array([0.3, -1.2, 0.4, -0.4, 0.6, 0.0, -0.3, 0.6])
-    sway = np.array([0.0, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.0])
+    """Targets with which arm and base sway at up to 0.5 rad/s."""
+    middle = np.array([0.3, -1.2, 0.4, -0.4, 0.6, 0.0, -0.3, 0.6, 0.0, 0.0, 0.0])
+    sway = np.array([0.0, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.0, 0.1, 0.1, 0.3])
     return middle + sway * np.sin(0.5 / 0.3 * np.arange(ticks)[:, None] / 50)
 
 

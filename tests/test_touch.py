@@ -64,7 +64,8 @@ def test_effective_force_gradients():
 
 def test_spike_density_is_clamped():
     rates = torch.tensor([-1.0, 0.0, 150.0, 300.0, 900.0])
-    assert spike_density(rates, 300.0).tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
+    for rate in (rates, rates.numpy()):
+        assert spike_density(rate, 300.0).tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
     with pytest.raises(ValueError, match="max_rate > 0"):
         spike_density(rates, 0.0)
 

@@ -1,202 +1,188 @@
-"""Episodes as samples, what a sample predicts, and which prediction holds on unseen episodes.
+"""Robot and episodes in the units in which the baselines learn and act.
 
-Joints are shares of their ranges and patch forces shares of the largest one in the episodes, so
-that distances mean the same for all of them.
+Joints are shares of their ranges. A mobile base, which has none, counts from where it stands at the
+beginning, in its own frame and in what it drives in ``FREE_SECONDS`` at full speed. The skin is the
+force on each patch and the resultant force in the base frame, so that nobody has to learn
+kinematics to know where a push leads.
 """
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from hasm_torch.body import Body
-from hasm_torch.data.episodes import Episode
+from hasm_torch.encoders.readings import patch_borders
+from hasm_torch.episode import Episode
 from hasm_torch.model.control import SPEED_SHARE
+from hasm_torch.model.felt import PushDirection
+from hasm_torch.model.frames import base_indices, into_base, out_of_base
 
-# Predictions are judged over so many samples of a held-out episode, from every STRIDE-th sample.
-WINDOW, STRIDE = 25, 50
-FOLDS = 3
+Array = NDArray[np.float64]
+
+FREE_SECONDS = 2.0
 
 
 class Series(NamedTuple):
-    """One episode.
+    """One episode, float32.
 
     Attributes:
         task: What is done.
-        state: (T, joints) measured positions, shares of the joint ranges.
-        action: (T, joints) commanded positions, the same.
-        touch: (T, patches) force on each patch, N.
+        state: (T, joints) measured positions, shares.
+        action: (T, joints) commanded positions, shares.
+        touch: (T, patches + 3) force on each patch and resultant, N.
+        seen: (T, N) further observations.
     """
 
     task: str
     state: Tensor
     action: Tensor
     touch: Tensor
+    seen: Tensor
 
 
-@dataclass(frozen=True)
-class Ahead:
-    """What is predicted of the action.
-
-    Attributes:
-        horizon: How many samples ahead.
-        mode: "displacement" predicts how far the action goes, which the policy adds to its
-            target; "target" predicts where it goes, and the policy heads there.
-    """
-
-    horizon: int
-    mode: Literal["displacement", "target"]
-
-
-class Predictor(Protocol):
-    """Predicts from samples; fitted when it is made."""
-
-    def predict(self, state: Tensor, touch: Tensor) -> Tensor:
-        """Value (B, joints) at states (B, joints) and touches (B, patches)."""
-
-    def memory_bytes(self) -> int:
-        """Bytes that it keeps."""
-
-
-Build = Callable[[Tensor, Tensor, Tensor], Predictor]
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One way to predict.
+class Units:
+    """Between readings and targets of a robot and what the baselines compute with.
 
     Attributes:
-        name: Its settings in words.
-        ahead: What it predicts.
-        build: Makes the predictor from states, touches and values.
-    """
-
-    name: str
-    ahead: Ahead
-    build: Build
-
-
-def patch_forces(skin: Tensor, body: Body) -> Tensor:
-    """Force on each patch, (..., patches) N, from the skin's points (..., cells, 3)."""
-    return torch.stack([part.sum((-1, -2)) for part in skin.split(body.cells, dim=-2)], dim=-1)
-
-
-def series_of(episode: Episode, body: Body) -> Series:
-    """An episode in shares of the joint ranges, and force by patch."""
-    lower, upper = torch.tensor(body.lower), torch.tensor(body.upper)
-    assert episode.tactile is not None
-    return Series(
-        episode.task,
-        (torch.from_numpy(episode.state) - lower) / (upper - lower),
-        (torch.from_numpy(episode.action) - lower) / (upper - lower),
-        patch_forces(torch.from_numpy(episode.tactile), body),
-    )
-
-
-def values_of(series: Series, ahead: Ahead) -> Tensor:
-    """What each sample predicts, (T, joints); an episode's last action stays.
-
-    displacement: (a(t+h) − a(t)) / h, one sample's part;  target: a(t+h).
-    """
-    last = len(series.action) - 1
-    later = series.action[(torch.arange(last + 1) + ahead.horizon).clamp(max=last)]
-    if ahead.mode == "target":
-        return later
-    return (later - series.action) / ahead.horizon
-
-
-def moved(reference: Tensor, value: Tensor, ahead: Ahead, largest: Tensor) -> Tensor:
-    """The reference one sample later, within the limits.
+        limited: (joints,) bool, which joints have limits.
+        largest: (joints,) largest way of a sample period, shares.
 
     Args:
-        reference: (B, joints) joint targets, shares.
-        value: (B, joints) predicted.
-        ahead: What the value is.
-        largest: (joints,) largest way of a sample, shares.
+        body: The robot.
     """
-    way = value if ahead.mode == "displacement" else (value - reference) / ahead.horizon
-    excess = (way.abs() / largest).amax(-1, keepdim=True).clamp(min=1.0)
-    return (reference + way / excess).clamp(0.0, 1.0)
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        low, high, speed = (np.array(x) for x in (body.lower, body.upper, body.max_speed))
+        limited = np.isfinite(high - low)
+        self._lower = np.where(limited, low, 0.0)
+        self._span = np.where(limited, np.where(limited, high - low, 1.0), FREE_SECONDS * speed)
+        self._base = base_indices(body)
+        self._direction = PushDirection(body, "base")
+        self._borders = patch_borders(tuple(body.cells))[:-1]
+        self._normals = np.array(body.normals)
+        self.limited = torch.from_numpy(limited)
+        self.largest = torch.from_numpy(speed * SPEED_SHARE / body.rate / self._span).float()
+
+    def shares(self, positions: Array, start: Array) -> Tensor:
+        """Positions (..., joints), rad or m, of a robot that began at ``start`` (joints,)."""
+        if self._base:
+            positions = positions.copy()
+            positions[..., self._base] -= start[self._base]
+            positions = into_base(positions, start[self._base[2]], self._base)
+        return torch.from_numpy((positions - self._lower) / self._span).float()
+
+    def positions(self, shares: Tensor, start: Array) -> Tensor:
+        """The inverse of ``shares``, (joints,) within the limits."""
+        positions: Array = self._lower + shares.double().numpy() * self._span
+        if self._base:
+            positions = out_of_base(positions, start[self._base[2]], self._base)
+            positions[self._base] += start[self._base]
+        return torch.from_numpy(np.clip(positions, self.body.lower, self.body.upper)).float()
+
+    def touch(self, skin: Array, positions: Array) -> Tensor:
+        """Force on each patch and resultant in the base frame, (T, patches + 3) N.
+
+        Args:
+            skin: (T, cells, 3), N.
+            positions: (T, joints), rad or m.
+        """
+        cells = skin.sum(axis=-1)
+        force = np.add.reduceat(cells, self._borders, axis=1)
+        push = -np.add.reduceat(cells[..., None] * self._normals, self._borders, axis=1)
+        resultant = (self._direction(push, positions) * force[..., None]).sum(axis=1)
+        return torch.from_numpy(np.concatenate([force, resultant], axis=1)).float()
+
+    def series(self, episode: Episode) -> Series:
+        """An episode in these units."""
+        assert episode.tactile is not None
+        state, action, skin = (
+            np.asarray(x, dtype=np.float64)
+            for x in (episode.state, episode.action, episode.tactile)
+        )
+        seen = np.zeros((len(state), 0)) if episode.observations is None else episode.observations
+        return Series(
+            episode.task,
+            self.shares(state, state[0]),
+            self.shares(action, state[0]),
+            self.touch(skin, state),
+            torch.from_numpy(np.asarray(seen)).float(),
+        )
+
+    def moved(self, reference: Tensor, way: Tensor) -> Tensor:
+        """The reference (joints,) one sample period later, in shares within all limits."""
+        excess = (way.abs() / self.largest).amax().clamp(min=1.0)
+        goal = reference + way / excess
+        return torch.where(self.limited, goal.clamp(0.0, 1.0), goal)
 
 
-def largest_way(body: Body) -> Tensor:
-    """Largest way of a joint in a sample period, (joints,) shares of its range."""
-    span = torch.tensor(body.upper) - torch.tensor(body.lower)
-    return torch.tensor(body.max_speed) * SPEED_SHARE / body.rate / span
+class Sensed(NamedTuple):
+    """What a baseline gets in one control step, as in ``Series``: state, touch and seen."""
+
+    state: Tensor
+    touch: Tensor
+    seen: Tensor
 
 
-def build(candidate: Candidate, episodes: Sequence[Series]) -> Predictor:
-    """Fit a candidate to episodes."""
-    values = torch.cat([values_of(series, candidate.ahead) for series in episodes])
-    states = torch.cat([series.state for series in episodes])
-    return candidate.build(states, torch.cat([series.touch for series in episodes]), values)
+class Baseline:
+    """A policy that follows ``way`` from step to step with a joint target of its own.
+
+    Args:
+        body: The robot.
+    """
+
+    def __init__(self, body: Body) -> None:
+        self.units = Units(body)
+        self.reset()
+
+    def reset(self) -> None:
+        """Start from the measured joints."""
+        self._start: Array | None = None
+        self.reference = torch.zeros(0)
+
+    @torch.no_grad()
+    def step(self, state: Tensor, skin: Tensor, *, observation: Tensor | None = None) -> Tensor:
+        """Target of one control step, see ``hasm_torch.evaluation.rollout.Policy``."""
+        measured = state.double().numpy()
+        first = self._start is None
+        if self._start is None:
+            self._start = measured
+        sensed = Sensed(
+            self.units.shares(measured, self._start),
+            self.units.touch(skin.double().numpy().reshape(1, -1, 3), measured[None])[0],
+            torch.zeros(0) if observation is None else observation.float(),
+        )
+        if first:
+            shares = sensed.state
+            self.reference = torch.where(self.units.limited, shares.clamp(0.0, 1.0), shares)
+        self.reference = self.units.moved(self.reference, self.way(sensed))
+        return self.units.positions(self.reference, self._start)
+
+    def way(self, sensed: Sensed) -> Tensor:
+        """Where the reference goes in one sample period, (joints,) shares."""
+        raise NotImplementedError
 
 
-def folds(episodes: Sequence[Series]) -> Iterator[tuple[list[Series], list[Series]]]:
+def folds(episodes: Sequence[Series], count: int) -> list[tuple[list[Series], list[Series]]]:
     """Split into learned and held-out episodes, so that each task stays among the learned ones.
 
-    Yields:
-        Nothing if a task has a single episode.
+    Returns:
+        At most ``count`` splits; none if a task has a single episode.
     """
     number: dict[str, int] = {}
     of: list[int] = []
     for series in episodes:
         of.append(number.get(series.task, 0))
         number[series.task] = of[-1] + 1
-    count = min(FOLDS, *number.values())
-    for fold in range(count if count > 1 else 0):
-        held = [series for series, i in zip(episodes, of) if i % count == fold]
-        yield [series for series, i in zip(episodes, of) if i % count != fold], held
-
-
-def error(predictor: Predictor, ahead: Ahead, held: Sequence[Series], largest: Tensor) -> float:
-    """Mean distance from held-out episodes when the predictions are followed, shares of the range.
-
-    The robot is taken to be where it is sent, and is touched as in the episode.
-    """
-    starts = [(s, t) for s in held for t in range(0, len(s.state) - WINDOW, STRIDE)]
-    reference = torch.stack([series.action[t] for series, t in starts])
-    total = 0.0
-    for step in range(WINDOW):
-        touch = torch.stack([series.touch[t + step] for series, t in starts])
-        value = predictor.predict(reference, touch)
-        reference = moved(reference, value, ahead, largest)
-        wanted = torch.stack([series.action[t + step + 1] for series, t in starts])
-        total += float((reference - wanted).abs().mean())
-    return total / WINDOW
-
-
-def cross_validate(
-    candidates: Sequence[Candidate], episodes: Sequence[Series], body: Body
-) -> tuple[Candidate, dict[str, float]]:
-    """The candidate that follows held-out episodes best.
-
-    Args:
-        candidates: To choose from; the first where no episode can be held out.
-        episodes: All that may be learned.
-        body: The robot.
-
-    Returns:
-        The choice, and every candidate's error by name.
-    """
-    largest = largest_way(body)
-    splits = list(folds(episodes))
-    if not splits:
-        return candidates[0], {}
-    errors = {
-        candidate.name: float(
-            np.mean([error(build(candidate, learned), candidate.ahead, held, largest)
-                     for learned, held in splits])
+    count = min(count, *number.values())
+    return [
+        (
+            [series for series, i in zip(episodes, of) if i % count != fold],
+            [series for series, i in zip(episodes, of) if i % count == fold],
         )
-        for candidate in candidates
-    }  # fmt: skip
-    best = min(candidates, key=lambda candidate: _finite(errors[candidate.name]))
-    return best, errors
-
-
-def _finite(value: float) -> float:
-    return value if math.isfinite(value) else math.inf
+        for fold in range(count if count > 1 else 0)
+    ]

@@ -1,13 +1,15 @@
-"""Faults of the skin, around any policy."""
+"""Faults of the skin, and the filter against them, around any policy."""
 
+import zlib
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hasm_torch.encoders.skin_filter import FilterState, clean_skin
 from hasm_torch.evaluation.rollout import Policy
 
 Kind = Literal["dead", "noise", "lost", "offset", "stuck"]
@@ -37,54 +39,71 @@ class Fault:
             )
 
 
-class FaultySkin:
-    """A policy that reads a damaged skin.
+@dataclass(frozen=True)
+class Filter:
+    """What the filter knows of a skin.
 
-    The damage of the n-th rollout depends on the generator and n alone, so that policies that
-    move differently meet the same one.
+    Attributes:
+        cells: Number of cells of each patch.
+        rate: Sampling rate, Hz.
+        footprint: (cells,) shares of its patch's force that each cell takes.
+    """
+
+    cells: list[int]
+    rate: float
+    footprint: NDArray[np.float32]
+
+
+class Skinned:
+    """A policy that reads a damaged skin, a filtered one, or both.
+
+    The damage of a rollout depends on the state in which it begins alone, so that all policies
+    meet the same one.
 
     Args:
         policy: The policy.
-        fault: What is wrong.
-        generator: Source of everything random.
+        fault: What is wrong, if anything.
+        filtered: The filter, if there is one.
     """
 
-    def __init__(self, policy: Policy, fault: Fault, generator: np.random.Generator) -> None:
-        self.policy, self.fault, self.generator = policy, fault, generator
-        self.rng = generator
-        self.cells: NDArray[np.int64] | None = None
+    def __init__(self, policy: Policy, fault: Fault | None, filtered: Filter | None) -> None:
+        self.policy, self.fault, self.filter = policy, fault, filtered
+        self.reset()
 
     def reset(self) -> None:
-        """Start a new rollout with other cells damaged."""
-        self.rng = self.generator.spawn(1)[0]
-        self.cells = None
+        """Start a new rollout."""
+        self.rng: np.random.Generator | None = None
+        self.cells: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.filtered: FilterState | None = None
         self.policy.reset()
 
-    def step(self, state: Tensor, skin: Tensor) -> Tensor:
-        """One control step of the policy, with what the damaged skin reads."""
-        return self.policy.step(state, self.damaged(skin))
+    def step(self, state: Tensor, skin: Tensor, **more: Any) -> Tensor:
+        """One control step of the policy, with what it reads."""
+        points: NDArray[np.float64] = skin.double().numpy().reshape(-1, 3)
+        if self.fault is not None:
+            if self.rng is None:
+                self.rng = np.random.default_rng(zlib.crc32(state.numpy().tobytes()))
+                count = {"dead": round(self.fault.level * len(points)), "stuck": 1}
+                order = self.rng.permutation(len(points))
+                self.cells = order[: count.get(self.fault.kind, 0)]
+            points = self._damaged(points, self.fault, self.rng)
+        read = torch.from_numpy(points.astype(np.float32))
+        if self.filter is not None:
+            cells, rate, footprint = self.filter.cells, self.filter.rate, self.filter.footprint
+            cleaned, self.filtered = clean_skin(read[None], cells, rate, footprint, self.filtered)
+            read = cleaned[0]
+        return self.policy.step(state, read.reshape(skin.shape), **more)
 
-    def damaged(self, skin: Tensor) -> Tensor:
-        """What the damaged skin reads.
-
-        Args:
-            skin: (cells, 3) or flat, N.
-
-        Returns:
-            The same shape, N.
-        """
-        points: NDArray[np.float64] = skin.detach().cpu().double().numpy().reshape(-1, 3)
-        kind, level = self.fault.kind, self.fault.level
-        if self.cells is None:
-            count = {"dead": round(level * len(points)), "stuck": 1}.get(kind, 0)
-            self.cells = self.rng.permutation(len(points))[:count]
-        if kind in ("dead", "stuck"):
+    def _damaged(
+        self, points: NDArray[np.float64], fault: Fault, rng: np.random.Generator
+    ) -> NDArray[np.float64]:
+        """What the damaged skin reads, (cells, 3) N."""
+        if fault.kind in ("dead", "stuck"):
             points = points.copy()
-            points[self.cells] = 0.0 if kind == "dead" else level
-        elif kind == "noise":
-            points = np.maximum(points + level * self.rng.standard_normal(points.shape), 0.0)
-        elif kind == "offset":
-            points = points + level
-        elif self.rng.random() < level:
-            points = np.zeros_like(points)
-        return torch.from_numpy(points.astype(np.float32)).reshape(skin.shape)
+            points[self.cells] = 0.0 if fault.kind == "dead" else fault.level
+            return points
+        if fault.kind == "noise":
+            return np.maximum(points + fault.level * rng.standard_normal(points.shape), 0.0)
+        if fault.kind == "offset":
+            return points + fault.level
+        return points * (rng.random() >= fault.level)

@@ -1,9 +1,7 @@
 """LeRobot's ACT and Diffusion Policy, small, as policies of the benchmark.
 
-They see what the other contestants see: joints as shares of their ranges and the force on each
-patch. Two things are done in their favour. Joints that no episode moves and patches that none
-touches are neither seen nor commanded, since a network answers unseen readings with anything; and
-rollouts of other seeds than the benchmark's chose how each experiment is learned (``SETTINGS``).
+They see what the nearest neighbours see. Joints that no episode moves and forces that none holds
+are neither seen nor commanded, since a network answers unseen readings with anything.
 """
 
 from collections import deque
@@ -11,14 +9,14 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from benchmarks.baselines.demonstrations import largest_way, patch_forces, series_of
+from benchmarks.baselines.demonstrations import Baseline, Sensed
 from benchmarks.baselines.learned_training import (
     ACTION,
+    ENVIRONMENT,
     PADDED,
     STATE,
-    TOUCH,
     Span,
     Training,
     Windows,
@@ -26,7 +24,7 @@ from benchmarks.baselines.learned_training import (
     gather,
 )
 from hasm_torch.body import Body
-from hasm_torch.data.episodes import Episode
+from hasm_torch.episode import Episode
 
 Mode = Literal["absolute", "increment"]
 
@@ -44,13 +42,17 @@ class Setting(NamedTuple):
     state_noise: float
 
 
-# Compliance begins in postures that no episode holds, where predicted commands jump and the noise
-# keeps increments from depending on the posture. Increments drift past the end of a grasp.
-SETTINGS = {"compliance": Setting("increment", 1.0), "grasp": Setting("absolute", 0.0)}
+# Where rollouts begin in postures that no episode holds, predicted commands jump; increments drift
+# past the end of a grasp. Compliance has few postures, on which the noise keeps increments from
+# depending; what yields depends on them.
+SETTINGS = {
+    "compliance": Setting("increment", 1.0),
+    "yield": Setting("increment", 0.0),
+    "grasp": Setting("absolute", 0.0),
+}
 
 MOVED = 0.01  # share of its range over which a joint goes if the episodes move it
 TOUCHED = 0.1  # N
-FORCE = 5.0  # N that a network sees as 1
 
 ACT_CHUNK, ACT_EXECUTED = 20, 10  # samples
 DIFFUSION_OBSERVED, DIFFUSION_HORIZON, DIFFUSION_EXECUTED = 2, 16, 8  # samples
@@ -67,11 +69,13 @@ class Scaling:
 
     def __init__(self, windows: Windows, mode: Mode) -> None:
         self.mode = mode
-        state = windows.state[:, -1]
+        state, seen = windows.state[:, -1], windows.seen[:, -1]
         self.moves = state.amax(0) - state.amin(0) > MOVED
-        self.mean = state.mean(0)
+        self.mean, self.seen_mean = state.mean(0), seen.mean(0)
         self.gain = torch.where(self.moves, 1.0 / state.std(0).clamp(min=MOVED / 10), 0.0)
-        self.touched = (windows.touch.amax((0, 1)) > TOUCHED) / FORCE
+        self.seen_gain = 1.0 / (seen.amax(0) - seen.amin(0)).clamp(min=1e-6)
+        strongest = windows.touch.abs().amax((0, 1))
+        self.touched = torch.where(strongest > TOUCHED, 1.0 / strongest, 0.0)
         value = self._value(windows)
         low, high = value.amin((0, 1)), value.amax((0, 1))
         if mode == "increment":  # standing still is 0
@@ -80,13 +84,17 @@ class Scaling:
         self.middle = (low + high) / 2
         self.half = torch.where(self.moves, (high - low) / 2, 1.0)
 
-    def observation(self, state: Tensor, touch: Tensor) -> dict[str, Tensor]:
-        """What is seen of states (..., joints), shares, and touches (..., patches), N."""
-        return {STATE: (state - self.mean) * self.gain, TOUCH: touch * self.touched}
+    def observation(self, sensed: Sensed) -> dict[str, Tensor]:
+        """What is seen of readings (..., all), by LeRobot's keys."""
+        seen = (sensed.seen - self.seen_mean) * self.seen_gain
+        return {
+            STATE: (sensed.state - self.mean) * self.gain,
+            ENVIRONMENT: torch.cat([sensed.touch * self.touched, seen], dim=-1),
+        }
 
     def batch(self, windows: Windows) -> dict[str, Tensor]:
         """Windows by LeRobot's keys; a single observation has no axis of its own."""
-        seen = self.observation(windows.state, windows.touch)
+        seen = self.observation(Sensed(windows.state, windows.touch, windows.seen))
         if windows.state.shape[1] == 1:
             seen = {key: value[:, 0] for key, value in seen.items()}
         value = (self._value(windows) - self.middle) / self.half * self.moves
@@ -100,106 +108,35 @@ class Scaling:
         return windows.action - (windows.before if self.mode == "increment" else 0.0)
 
 
-# Predicts (1, horizon, joints) from a batch, with random numbers of the generator.
-Predict = Callable[[dict[str, Tensor], torch.Generator], Tensor]
+class Kind(NamedTuple):
+    """How one of LeRobot's policies is made and asked.
 
-
-class ChunkPolicy:
-    """Plans chunks of commands and carries out the first part of each.
-
-    Args:
-        body: The robot.
-        network: A LeRobot policy.
-        predict: Plans with it.
-        scaling: What it sees and predicts.
+    Attributes:
+        make: Network of an observation's feature shapes, see ``_features``.
+        chunk: Plan (1, horizon, joints) of a network for a batch, drawn with a generator.
         observed: Observations up to the current one that it sees.
-        executed: Commands of a chunk that are carried out.
-        seed: Seed of its noise, which is the same in every rollout.
+        span: Samples that a plan reaches over.
+        executed: Commands of a plan that are carried out.
     """
 
-    def __init__(
-        self,
-        body: Body,
-        network: torch.nn.Module,
-        predict: Predict,
-        scaling: Scaling,
-        observed: int,
-        executed: int,
-        seed: int,
-    ) -> None:
-        self.body, self.network, self.predict, self.scaling = body, network, predict, scaling
-        self.executed, self.seed = executed, seed
-        self.lower, self.upper = torch.tensor(body.lower), torch.tensor(body.upper)
-        self.largest = largest_way(body)
-        self.seen: deque[tuple[Tensor, Tensor]] = deque(maxlen=observed)
-        self.chunk: deque[Tensor] = deque()
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget what was seen and planned; start from the measured joints."""
-        self.seen.clear()
-        self.chunk.clear()
-        self.reference: Tensor | None = None
-        self.generator = torch.Generator().manual_seed(self.seed)
-
-    @torch.no_grad()
-    def step(self, state: Tensor, skin: Tensor) -> Tensor:
-        """Target of one control step, (joints,)."""
-        span = self.upper - self.lower
-        share = (state.float() - self.lower) / span
-        touch = patch_forces(skin.float().reshape(-1, 3), self.body)
-        if self.reference is None:
-            self.reference = share.clamp(0.0, 1.0)
-            self.seen.extend([(share, touch)] * (self.seen.maxlen or 1))
-        self.seen.append((share, touch))
-        if not self.chunk:
-            self._plan()
-        goal = self.chunk.popleft()
-        if self.scaling.mode == "increment":
-            goal = self.reference + goal
-        way = (goal - self.reference) * self.scaling.moves
-        excess = (way.abs() / self.largest).amax().clamp(min=1.0)
-        self.reference = (self.reference + way / excess).clamp(0.0, 1.0)
-        return (self.lower + self.reference * span).clamp(self.lower, self.upper)
-
-    def memory_bytes(self) -> int:
-        """Bytes of the parameters."""
-        return sum(parameter.nbytes for parameter in self.network.parameters())
-
-    def _plan(self) -> None:
-        states, touches = (torch.stack(column)[None] for column in zip(*self.seen))
-        batch = self.scaling.observation(states, touches)
-        if len(self.seen) == 1:
-            batch = {key: value[:, 0] for key, value in batch.items()}
-        chunk = self.predict(batch, self.generator)[0, : self.executed]
-        self.chunk.extend(self.scaling.value(chunk))
+    make: Callable[[dict[str, Any]], nn.Module]
+    chunk: Callable[[Any, dict[str, Tensor], torch.Generator], Tensor]
+    observed: int
+    span: Span
+    executed: int
 
 
-Outcome = tuple[ChunkPolicy, dict[str, Any]]
-
-
-def act(
-    experiment: str, body: Body, episodes: Sequence[Episode], training: Training | None = None
-) -> Outcome:
-    """Train an Action Chunking Transformer of 0.9 M parameters.
+def _make_act(features: dict[str, Any]) -> nn.Module:
+    """0.9 M parameters.
 
     It has no variational encoder, since the episodes hold one way of doing each thing; updates
     take less than half the time without it.
-
-    Args:
-        experiment: "compliance" or "grasp".
-        body: The robot.
-        episodes: What is learned.
-        training: How; ``Training()`` by default.
-
-    Returns:
-        The policy; its ``parameters``, its ``mode`` and what ``fit`` tells.
     """
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
 
     config = ACTConfig(
-        **_features(body),
+        **features,
         chunk_size=ACT_CHUNK,
         n_action_steps=ACT_EXECUTED,
         dim_model=128,
@@ -209,30 +146,21 @@ def act(
         use_vae=False,
         dropout=0.0,
     )
-
-    def make() -> tuple[torch.nn.Module, Predict]:
-        network = ACTPolicy(config)
-        return network, lambda batch, _: network.predict_action_chunk(batch)
-
-    span = Span(0, ACT_CHUNK - 1)
-    return _train(experiment, body, episodes, training, make, 1, span, ACT_EXECUTED)
+    return ACTPolicy(config)
 
 
-def diffusion(
-    experiment: str, body: Body, episodes: Sequence[Episode], training: Training | None = None
-) -> Outcome:
-    """Train a Diffusion Policy of 2.8 M parameters that denoises in ten DDIM steps.
+def _act_chunk(network: Any, batch: dict[str, Tensor], generator: torch.Generator) -> Tensor:
+    chunk: Tensor = network.predict_action_chunk(batch)
+    return chunk
 
-    Args and returns are those of ``act``.
 
-    Raises:
-        ImportError: Without the package diffusers, which LeRobot's policy needs.
-    """
+def _make_diffusion(features: dict[str, Any]) -> nn.Module:
+    """2.8 M parameters that denoise in ten DDIM steps."""
     from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
     config = DiffusionConfig(
-        **_features(body),
+        **features,
         n_obs_steps=DIFFUSION_OBSERVED,
         horizon=DIFFUSION_HORIZON,
         n_action_steps=DIFFUSION_EXECUTED,
@@ -244,57 +172,115 @@ def diffusion(
         clip_sample_range=BEYOND,
         do_mask_loss_for_padding=True,
     )
-    shape = (1, DIFFUSION_HORIZON, len(body.joints))
+    return DiffusionPolicy(config)
 
-    def make() -> tuple[torch.nn.Module, Predict]:
-        network = DiffusionPolicy(config)
-        return network, lambda batch, generator: network.predict_action_chunk(
-            batch, noise=torch.randn(shape, generator=generator)
-        )
 
-    first = 1 - DIFFUSION_OBSERVED
-    span = Span(first, first + DIFFUSION_HORIZON - 1)
-    return _train(
-        experiment, body, episodes, training, make, DIFFUSION_OBSERVED, span, DIFFUSION_EXECUTED
-    )
+def _diffusion_chunk(network: Any, batch: dict[str, Tensor], generator: torch.Generator) -> Tensor:
+    joints = batch[STATE].shape[-1]
+    noise = torch.randn((1, DIFFUSION_HORIZON, joints), generator=generator)
+    chunk: Tensor = network.predict_action_chunk(batch, noise=noise)
+    return chunk
+
+
+_FIRST = 1 - DIFFUSION_OBSERVED
+ACT = Kind(_make_act, _act_chunk, 1, Span(0, ACT_CHUNK - 1), ACT_EXECUTED)
+DIFFUSION = Kind(
+    _make_diffusion,
+    _diffusion_chunk,
+    DIFFUSION_OBSERVED,
+    Span(_FIRST, _FIRST + DIFFUSION_HORIZON - 1),
+    DIFFUSION_EXECUTED,
+)
+
+
+class ChunkPolicy(Baseline):
+    """Plans chunks of commands and carries out the first part of each.
+
+    Attributes:
+        notes: ``parameters``, ``mode`` and what ``learned_training.fit`` tells.
+
+    Args:
+        kind: ``ACT`` or ``DIFFUSION``; the latter needs the package diffusers.
+        experiment: "compliance", "yield" or "grasp".
+        body: The robot.
+        episodes: What is learned.
+        training: How.
+
+    Raises:
+        ValueError: If there is no such experiment.
+    """
+
+    def __init__(
+        self,
+        kind: Kind,
+        experiment: str,
+        body: Body,
+        episodes: Sequence[Episode],
+        training: Training,
+    ) -> None:
+        if experiment not in SETTINGS:
+            raise ValueError(f"unknown experiment {experiment!r}, valid: {', '.join(SETTINGS)}")
+        self.kind, self.seed = kind, training.seed
+        self.sensed: deque[Sensed] = deque(maxlen=kind.observed)
+        self.chunk: deque[Tensor] = deque()
+        super().__init__(body)
+        mode, state_noise = SETTINGS[experiment]
+        series = [self.units.series(episode) for episode in episodes]
+        trained, held = gather(series, kind.observed, kind.span, body.rate)
+        self.scaling = Scaling(trained, mode)
+        # LeRobot's modules draw from the global generator.
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(training.seed)
+            self.network = kind.make(_features(body))
+            noise = state_noise * self.scaling.moves
+            batches = self.scaling.batch(trained), self.scaling.batch(held)
+            notes = fit(self.network, *batches, training, noise)
+        parameters = sum(parameter.numel() for parameter in self.network.parameters())
+        self.notes = {"parameters": parameters, "mode": mode, **notes}
+
+    def reset(self) -> None:
+        """Forget what was sensed and planned; start from the measured joints."""
+        super().reset()
+        self.sensed.clear()
+        self.chunk.clear()
+        self.generator: torch.Generator | None = None
+
+    def way(self, sensed: Sensed) -> Tensor:
+        """See ``Baseline``."""
+        if not self.sensed:
+            self.sensed.extend([sensed] * self.kind.observed)
+        self.sensed.append(sensed)
+        if not self.chunk:
+            self._plan()
+        goal = self.chunk.popleft()
+        way = goal if self.scaling.mode == "increment" else goal - self.reference
+        return way * self.scaling.moves
+
+    def memory_bytes(self) -> int:
+        """Bytes of the parameters."""
+        return sum(parameter.nbytes for parameter in self.network.parameters())
+
+    def _plan(self) -> None:
+        batch = self.scaling.observation(Sensed(*(torch.stack(x)[None] for x in zip(*self.sensed))))
+        if self.kind.observed == 1:
+            batch = {key: value[:, 0] for key, value in batch.items()}
+        if self.generator is None:  # the same noise in every rollout
+            self.generator = torch.Generator().manual_seed(self.seed)
+        chunk = self.kind.chunk(self.network, batch, self.generator)[0, : self.kind.executed]
+        self.chunk.extend(self.scaling.value(chunk))
 
 
 def _features(body: Body) -> dict[str, Any]:
+    """What LeRobot's configurations are told of a robot."""
     from lerobot.configs import FeatureType, PolicyFeature
 
-    joints, patches = (len(body.joints),), (len(body.patches),)
+    joints = (len(body.joints),)
+    felt = (len(body.patches) + 3 + sum(body.observations.values()),)
     return {
         "input_features": {
             STATE: PolicyFeature(FeatureType.STATE, joints),
-            TOUCH: PolicyFeature(FeatureType.ENV, patches),
+            ENVIRONMENT: PolicyFeature(FeatureType.ENV, felt),
         },
         "output_features": {ACTION: PolicyFeature(FeatureType.ACTION, joints)},
         "device": "cpu",
     }
-
-
-def _train(
-    experiment: str,
-    body: Body,
-    episodes: Sequence[Episode],
-    training: Training | None,
-    make: Callable[[], tuple[torch.nn.Module, Predict]],
-    observed: int,
-    span: Span,
-    executed: int,
-) -> Outcome:
-    if experiment not in SETTINGS:
-        raise ValueError(f"unknown experiment {experiment!r}, valid: {', '.join(SETTINGS)}")
-    training, (mode, state_noise) = training or Training(), SETTINGS[experiment]
-    series = [series_of(episode, body) for episode in episodes]
-    trained, held = gather(series, observed, span, body.rate)
-    scaling = Scaling(trained, mode)
-    # LeRobot's modules draw from the global generator.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(training.seed)
-        network, predict = make()
-        noise = state_noise * scaling.moves
-        notes = fit(network, scaling.batch(trained), scaling.batch(held), training, noise)
-    parameters = sum(parameter.numel() for parameter in network.parameters())
-    policy = ChunkPolicy(body, network, predict, scaling, observed, executed, training.seed)
-    return policy, {"parameters": parameters, "mode": mode, **notes}

@@ -23,7 +23,7 @@ WARM_UP, LAST_RATE = 50, 0.01  # updates to the full learning rate; share of it 
 CLIP_NORM = 10.0
 
 # LeRobot's keys.
-STATE, TOUCH = "observation.state", "observation.environment_state"
+STATE, ENVIRONMENT = "observation.state", "observation.environment_state"
 ACTION, PADDED = "action", "action_is_pad"
 
 
@@ -71,15 +71,17 @@ class Windows(NamedTuple):
     """What a network sees and should do, one row a window.
 
     Attributes:
-        state: (N, observed, joints) measured positions, shares of the joint ranges.
-        touch: (N, observed, patches) force on each patch, N.
-        action: (N, horizon, joints) commanded positions, shares of the joint ranges.
+        state: (N, observed, joints) measured positions, shares.
+        touch: (N, observed, patches + 3) forces, N.
+        seen: (N, observed, O) further observations.
+        action: (N, horizon, joints) commanded positions, shares.
         before: (N, horizon, joints) the commands one sample earlier, the same.
         padded: (N, horizon) true behind the end of the episode, where the last command stays.
     """
 
     state: Tensor
     touch: Tensor
+    seen: Tensor
     action: Tensor
     before: Tensor
     padded: Tensor
@@ -101,6 +103,7 @@ def windows_of(series: Series, starts: Tensor, observed: int, span: Span) -> Win
     return Windows(
         series.state[seen],
         series.touch[seen],
+        series.seen[seen],
         series.action[done],
         series.action[earlier],
         wanted > end,

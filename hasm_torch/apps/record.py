@@ -14,12 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hasm_torch.data.episodes import Episode
+from hasm_torch.apps.command_line import parse_options
 from hasm_torch.data.recording import write_episodes
 from hasm_torch.data.skin import SkinPatch, skin_patches
+from hasm_torch.episode import Episode
 
+PREFIX = "observation."  # of the features that further observations become
 Array = NDArray[np.float32]
 Controller = Callable[[Any, dict[str, Any]], Array]
+Recorded = tuple[Episode, dict[str, int]]  # and the entries of each further observation
 
 
 @dataclass
@@ -31,6 +34,8 @@ class EnvSource:
         options: Keyword arguments of the environment.
         state: Observation key of the joint positions.
         tactile: Observation key of the skin, flat or (cells, channels); empty for none.
+        observations: Observation keys of what is to be bound besides, such as
+            "environment_state"; each becomes the feature "observation.<key>".
         controller: "hold" asks for the joints' own positions, so that what is recorded is how the
             environment moves them; "module:function" names a function of (observation, info)
             that gives the joint targets.
@@ -40,6 +45,7 @@ class EnvSource:
     options: dict[str, Any] = field(default_factory=dict)
     state: str = "state"
     tactile: str = "tactile"
+    observations: list[str] = field(default_factory=list)
     controller: str = "hold"
 
 
@@ -51,8 +57,9 @@ class RecordConfig:
         root: Folder of the new dataset.
         env: An environment to record.
         arrays: In place of an environment an ``.npz`` with "state" (T, joints) and optionally
-            "action" (T, joints; by default the next state), "tactile" (T, cells, channels) and
-            "episode" (T,) integers.
+            "action" (T, joints; by default the next state), "tactile" (T, cells, channels),
+            "episode" (T,) integers, and (T, entries) of each further observation to bind under
+            its feature's name, "observation.environment_state" or another "observation.<name>".
         joints: Names of the joints.
         units: Unit of each joint; "rad" for all by default.
         patches: Names of skin patches that share the cells equally; by default one, "skin", or
@@ -120,10 +127,11 @@ def record(config: RecordConfig) -> Path:
         env.close()
 
 
-def _write(config: RecordConfig, episodes: Iterator[Episode], fps: int, skin: Any) -> Path:
-    first = next(episodes, None)
-    if first is None:
+def _write(config: RecordConfig, episodes: Iterator[Recorded], fps: int, skin: Any) -> Path:
+    found = next(episodes, None)
+    if found is None:
         raise ValueError("expected at least one episode, got none")
+    first, bound = found
     joints = first.state.shape[1]
     if len(config.joints) != joints:
         raise ValueError(
@@ -132,7 +140,7 @@ def _write(config: RecordConfig, episodes: Iterator[Episode], fps: int, skin: An
 
     def all_episodes() -> Iterator[Episode]:
         yield first
-        yield from episodes
+        yield from (episode for episode, _ in episodes)
 
     assert config.root is not None
     return write_episodes(
@@ -143,6 +151,10 @@ def _write(config: RecordConfig, episodes: Iterator[Episode], fps: int, skin: An
         skin=_patches(config, first, skin),
         fps=fps,
         robot_type=config.robot_type,
+        observations={
+            key: [f"{key.removeprefix(PREFIX)}_{i}" for i in range(size)]
+            for key, size in bound.items()
+        },
         overwrite=config.overwrite,
     )
 
@@ -163,17 +175,17 @@ def _patches(config: RecordConfig, first: Episode, skin: Any) -> dict[str, SkinP
     }
 
 
-def _from_arrays(config: RecordConfig, fps: int) -> Iterator[Episode]:
+def _from_arrays(config: RecordConfig, fps: int) -> Iterator[Recorded]:
     if config.arrays is None or not config.arrays.is_file():
         raise FileNotFoundError(f"no file {config.arrays}: expected an .npz with state (T, joints)")
     with np.load(config.arrays) as arrays:
         series = dict(arrays)
     known = ("state", "action", "tactile", "episode")
-    unknown = sorted(set(series) - set(known))
-    if "state" not in series or unknown:
+    further = sorted(set(series) - set(known))
+    if "state" not in series or not all(name.startswith(PREFIX) for name in further):
         raise ValueError(
             f"{config.arrays} holds {sorted(series)}, expected state and what there is of "
-            f"{', '.join(known[1:])}"
+            f"{', '.join(known[1:])}, {PREFIX}<name>"
         )
     state = series["state"]
     lengths = {name: len(values) for name, values in series.items()}
@@ -185,29 +197,38 @@ def _from_arrays(config: RecordConfig, fps: int) -> Iterator[Episode]:
         rows = slice(start, stop)
         action = series["action"][rows] if "action" in series else _next(state[rows])
         tactile = _cells(config, series["tactile"][rows]) if "tactile" in series else None
-        yield _episode(config, number, state[rows], action, tactile, fps)
+        observations = {name: series[name][rows] for name in further}
+        yield _episode(config, number, state[rows], action, tactile, observations, fps)
 
 
-def _from_env(config: RecordConfig, env: Any, fps: int) -> Iterator[Episode]:
-    controller = _controller(config.env)
+def _from_env(config: RecordConfig, env: Any, fps: int) -> Iterator[Recorded]:
+    controller, source = _controller(config.env), config.env
+    named = [("state", source.state), *(("observations", key) for key in source.observations)]
+    if source.tactile:
+        named.append(("tactile", source.tactile))
     for number in range(config.episodes):
         observation, info = env.reset(seed=config.seed + number)
-        rows: list[tuple[Any, Any, Any]] = []
+        rows: list[tuple[Any, Any, Any, Any]] = []
         over = False
         while not over and len(rows) < config.max_steps:
-            if config.env.state not in observation:
-                raise ValueError(
-                    f"{config.env.id} observes {sorted(observation)}, not {config.env.state!r}: "
-                    "give --env.state"
-                )
+            for option, key in named:
+                if key not in observation:
+                    raise ValueError(
+                        f"{config.env.id} observes {sorted(observation)}, not {key!r}: give "
+                        f"--env.{option}"
+                    )
             action = np.asarray(controller(observation, info), dtype=np.float32)
             skin = observation[config.env.tactile] if config.env.tactile else None
-            rows.append((observation[config.env.state], action, skin))
+            seen = [np.array(observation[key]) for key in config.env.observations]
+            rows.append((observation[config.env.state], action, skin, seen))
             observation, _, terminated, truncated, info = env.step(action)
             over = terminated or truncated
-        states, actions, skins = zip(*rows)
+        states, actions, skins, others = zip(*rows)
         tactile = _cells(config, np.array(skins)) if config.env.tactile else None
-        yield _episode(config, number, np.array(states), np.array(actions), tactile, fps)
+        names = (PREFIX + key for key in config.env.observations)
+        observations = {name: np.stack(values) for name, values in zip(names, zip(*others))}
+        state, action = np.array(states), np.array(actions)
+        yield _episode(config, number, state, action, tactile, observations, fps)
 
 
 def _controller(source: EnvSource) -> Controller:
@@ -238,18 +259,25 @@ def _cells(config: RecordConfig, tactile: Array) -> Array:
 
 
 def _episode(
-    config: RecordConfig, number: int, state: Array, action: Array, tactile: Array | None, fps: int
-) -> Episode:
+    config: RecordConfig,
+    number: int,
+    state: Array,
+    action: Array,
+    tactile: Array | None,
+    observations: dict[str, Array],
+    fps: int,
+) -> Recorded:
     time = np.arange(len(state)) / fps
-    return Episode(number, config.task, time, state, action, tactile)
+    flat = [values.reshape(len(state), -1) for values in observations.values()]
+    sizes = {name: values.shape[1] for name, values in zip(observations, flat)}
+    bound = np.concatenate(flat, axis=1) if flat else None
+    return Episode(number, config.task, time, state, action, tactile, bound), sizes
 
 
 def main() -> None:
     """Record with the options of the command line."""
-    import draccus
-
     try:
-        root = record(draccus.parse(config_class=RecordConfig))
+        root = record(parse_options(RecordConfig))
     except (FileExistsError, FileNotFoundError, ValueError) as error:
         sys.exit(f"hasm-record: {error}")
     print(f"recorded {root}; train on it with: uv run train.py --dataset.root={root}")

@@ -1,124 +1,46 @@
-"""Recordings for the Rerun viewer: joints, skin in 3D, spikes and recall weights over time.
+"""The episodes of a dataset for the Rerun viewer.
 
 uv run python -m hasm_torch.apps.rerun_recording --dataset.root=data/mine --output=mine.rrd
 """
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
-from hasm_torch.apps.training import DatasetConfig
+from hasm_torch.apps.command_line import parse_options
 from hasm_torch.config import HASMConfig
-from hasm_torch.model.hasm import HASM
-from hasm_torch.model.learning import spike_series
-
-Array = NDArray[Any]
-
-CELL_RADIUS = 0.012  # m, half a cell's width
-FULL_COLOUR = 4.0  # N in one cell
-_IDLE, _PRESSED = np.array([30.0, 90.0, 70.0]), np.array([255.0, 60.0, 20.0])
+from hasm_torch.data.body import body_of
+from hasm_torch.data.episodes import FeatureMap, load_episodes
+from hasm_torch.data.training import DatasetConfig, RobotConfig
+from hasm_torch.evaluation.viewer import Scenes, cell_places, write_recording
+from hasm_torch.model.felt import calibrate, recorded_forces, skin_encoder
 
 
-@dataclass
-class Scenes:
-    """What a recording shows, one row a sample.
-
-    Attributes:
-        time: (T,) s.
-        joints: Names of the joints.
-        state: (T, joints) rad or m.
-        skin: (T, cells, points) N, or None.
-        patches: Names of the patches.
-        spikes: (T, patches) spikes in each sample period, or None.
-        weights: Touched patch and recall weight of each of its associations, or None without
-            touch; empty where no memory was recalled.
-        cells: (T, cells, 3) places of the cells in the base frame, m, or None.
-    """
-
-    time: Array
-    joints: list[str]
-    state: Array
-    skin: Array | None = None
-    patches: list[str] = field(default_factory=list)
-    spikes: Array | None = None
-    weights: Sequence[tuple[str, Array] | None] = field(default_factory=list)
-    cells: Array | None = None
-
-
-def write_recording(path: Path, scenes: Scenes, name: str) -> None:
-    """Write an ``.rrd`` file.
-
-    Args:
-        path: File to write.
-        scenes: What it shows.
-        name: Name of the recording in the viewer.
-    """
-    import rerun as rr
-
-    stream = rr.RecordingStream(name)
-    stream.save(path)
-    times = [rr.TimeColumn("time", duration=np.asarray(scenes.time, dtype=np.float64))]
-    for joint, values in zip(scenes.joints, np.asarray(scenes.state).T):
-        stream.send_columns(f"joints/{joint}", times, rr.Scalars.columns(scalars=values))
-    if scenes.spikes is not None:
-        for patch, values in zip(scenes.patches, np.asarray(scenes.spikes).T):
-            stream.send_columns(f"spikes/{patch}", times, rr.Scalars.columns(scalars=values))
-    if scenes.skin is not None:
-        force = np.abs(scenes.skin).sum(axis=-1)
-        stream.send_columns("skin/force", times, rr.Scalars.columns(scalars=force.sum(axis=1)))
-        if scenes.cells is not None:
-            for i, t in enumerate(scenes.time):
-                stream.set_time("time", duration=float(t))
-                points = rr.Points3D(scenes.cells[i], colors=colours(force[i]), radii=CELL_RADIUS)
-                stream.log("skin/cells", points)
-    for t, weights in zip(scenes.time, scenes.weights):
-        if weights is not None:
-            stream.set_time("time", duration=float(t))
-            stream.log(f"recall/{weights[0]}", rr.BarChart(weights[1]))
-    stream.flush()
-
-
-def colours(force: Array) -> NDArray[np.uint8]:
-    """(cells, 3) colours, from green without force to red at 4 N."""
-    share = np.clip(np.asarray(force) / FULL_COLOUR, 0.0, 1.0)[:, None]
-    return (_IDLE + share * (_PRESSED - _IDLE)).astype(np.uint8)
-
-
-def cell_places(joints: list[str], state: Array) -> Array | None:
-    """Places of the HSR's skin cells in the base frame, (T, cells, 3), m; None for other robots."""
-    from hasm_torch.robot import JOINTS, Kinematics, Skin
-
-    if list(joints) != list(JOINTS):
-        return None
-    positions, _ = Skin.load().poses(Kinematics(), torch.as_tensor(np.asarray(state)).double())
-    return positions.numpy()
-
-
-def dataset_scenes(root: Path) -> Scenes:
+def dataset_scenes(
+    root: Path, features: FeatureMap | None = None, urdf: Path | None = None
+) -> Scenes:
     """All episodes of a dataset, one after the other.
 
-    Raises:
-        FileNotFoundError, ValueError: See ``load_episodes``.
-    """
-    from hasm_torch.data.body import body_of
-    from hasm_torch.data.episodes import load_episodes
+    Args:
+        root: Folder of the dataset.
+        features: Which features are read; LeRobot's usual names by default.
+        urdf: The robot's URDF, see ``body_of``.
 
-    data = load_episodes(root)
+    Raises:
+        FileNotFoundError, ValueError: See ``load_episodes`` and ``body_of``.
+    """
+    data = load_episodes(root, features)
     state = np.concatenate([episode.state for episode in data])
     scenes = Scenes(np.arange(len(state)) / data.fps, list(data.joints), state)
-    skins = [episode.tactile for episode in data if episode.tactile is not None]
-    if data.skin and len(skins) == len(data):
-        model = HASM(HASMConfig(), body_of(data))
-        counts = [spike_series(model, torch.from_numpy(skin))[0].numpy() for skin in skins]
-        scenes.skin, scenes.patches = np.concatenate(skins), list(data.skin)
-        scenes.spikes = np.concatenate(counts)
-        scenes.cells = cell_places(scenes.joints, state)
+    if data.skin:
+        config, body = HASMConfig(), body_of(data, urdf)
+        encoder = skin_encoder(config, body, *calibrate(config, body, data))
+        forces = [recorded_forces(body, episode) for episode in data]
+        scenes.spikes = np.concatenate([encoder(skin)[0].spikes.numpy() for skin in forces])
+        scenes.skin = np.concatenate([skin.numpy() for skin in forces])
+        scenes.patches, scenes.cells = body.patches, cell_places(scenes.joints, state)
     return scenes
 
 
@@ -128,23 +50,26 @@ class RecordingConfig:
 
     Attributes:
         dataset: Which dataset to show.
+        features: Which of its features are read.
+        robot: Which robot recorded it.
         output: The ``.rrd`` file to write.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    features: FeatureMap = field(default_factory=FeatureMap)
+    robot: RobotConfig = field(default_factory=RobotConfig)
     output: Path = Path("episodes.rrd")
 
 
 def main() -> None:
     """Write a recording of a dataset."""
-    import draccus
-
-    config = draccus.parse(config_class=RecordingConfig)
+    config = parse_options(RecordingConfig)
     if config.dataset.root is None:
         sys.exit("a dataset is needed, for example --dataset.root=datasets/hsr_grasp")
     try:
-        write_recording(config.output, dataset_scenes(config.dataset.root), "episodes")
-    except (FileNotFoundError, ValueError) as error:
+        scenes = dataset_scenes(config.dataset.root, config.features, config.robot.urdf)
+        write_recording(config.output, scenes, "episodes")
+    except (OSError, ValueError) as error:
         sys.exit(str(error))
     print(f"{config.output}: open it with `uv run rerun {config.output}`")
 

@@ -1,8 +1,9 @@
-"""The body that a dataset describes: joint limits, and skin of any layout."""
+"""The body that a dataset describes: joint limits, skin of any layout, what else is bound."""
 
 import math
 import warnings
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,9 +11,12 @@ import numpy as np
 
 from hasm_torch._assets import asset_path
 from hasm_torch.body import Body
-from hasm_torch.data.episodes import Episode, EpisodeSet, EpisodeStream
+from hasm_torch.data.episodes import EpisodeSet, EpisodeStream
 from hasm_torch.data.skin import SkinPatch
-from hasm_torch.encoders.readings import DIRECTIONS, WRENCH
+from hasm_torch.encoders.readings import PUSHES, WRENCH
+from hasm_torch.episode import Episode
+from hasm_torch.robot.kinematics import Kinematics
+from hasm_torch.robot.turns import link_turns, planar_base, rigid_body
 from hasm_torch.robot.urdf import UrdfJoint, read_urdf
 
 Dataset = EpisodeSet | EpisodeStream
@@ -23,15 +27,16 @@ BEYOND, FAR = 0.01, 0.5
 # Faster than the speed limit by this factor: the frame rate is wrong.
 TOO_FAST = 2.0
 DEGREES = ("deg", "degree", "degrees", "°")
+FROM_DATA = "the range of the data"
+UPWARD = [0.0, 0.0, 1.0]  # normal of a cell of which the dataset tells none
 
 
 class Limits(NamedTuple):
-    """Limits of every joint, in the dataset's units and order, and where they come from."""
+    """Limits of every joint, in the dataset's units and order."""
 
     lower: list[float]
     upper: list[float]
     max_speed: list[float]
-    source: str
 
 
 def body_of(data: Dataset, urdf: Path | None = None) -> Body:
@@ -39,61 +44,105 @@ def body_of(data: Dataset, urdf: Path | None = None) -> Body:
 
     Args:
         data: The episodes; each is looked at once or twice.
-        urdf: The robot's URDF. Without it the limits are the bundled HSR's where that has all of
-            the dataset's joints, else the range of the data.
+        urdf: The robot's URDF. Without it, it is the bundled HSR's where that has all of the
+            dataset's joints; else limits are the range of the data, and directions of touch stay
+            in their link's frame.
 
     Returns:
-        The body, in the order of the dataset's vectors.
+        The body, in the order of the dataset's vectors. A joint that the URDF does not limit has
+        no limits.
 
     Raises:
+        FileNotFoundError: If there is no URDF where it is looked for.
         ValueError: If the URDF lacks one of the joints, or the data cannot be in its units.
     """
-    return _body(data, limits_of(data, urdf))
+    limits, chosen = limits_of(data, urdf), _urdf_of(data, urdf)
+    patches = list((data.skin or {}).values())
+    cells = [_cells_of(patch) for patch in patches] or [[UPWARD]]
+    parts = [patch.link or f"patch {patch.name}" for patch in patches]  # a body each if unknown
+    body = Body(
+        joints=list(data.joints),
+        lower=limits.lower,
+        upper=limits.upper,
+        max_speed=limits.max_speed,
+        patches=[patch.name.replace(".", "_") for patch in patches] or ["sequence"],
+        cells=[len(normals) for normals in cells],
+        normals=[normal for normals in cells for normal in normals],
+        links=[patch.link or "" for patch in patches] or [""],
+        groups=[parts.index(part) for part in parts] or [0],
+        observations=dict(data.observations),
+        rate=float(data.fps),
+        channels=patches[0].channels if patches else 0,
+        unit=patches[0].unit if patches else "N",
+    )
+    return body if chosen is None else _jointed(body, chosen)
+
+
+def _jointed(body: Body, urdf: Path) -> Body:
+    """The body with what its URDF says of base, links and rigid parts."""
+    kinematics = Kinematics(urdf, body.joints)
+    robot = kinematics.robot
+    known = [link for link in dict.fromkeys(body.links) if link in robot.links]
+    if strange := sorted(set(body.links) - {*known, ""}):
+        warnings.warn(
+            f"{urdf} has no link {', '.join(strange)}, which carry skin in the dataset: directions "
+            "of touch stay in these links' own frames",
+            stacklevel=3,
+        )
+    rigid = [
+        rigid_body(robot, link) if link in known else str(group)
+        for link, group in zip(body.links, body.groups)
+    ]
+    return replace(
+        body,
+        base=planar_base(robot, body.joints),
+        chains={link: link_turns(kinematics, body.joints, link) for link in known},
+        groups=[rigid.index(part) for part in rigid],
+    )
 
 
 def describe_body(data: Dataset, body: Body, urdf: Path | None = None) -> list[str]:
     """Where limits and touch of ``body_of`` come from, a line each, for people."""
-    lines = [f"joint limits: {_limits_source(data, urdf)}"]
+    lines = [f"joint limits: {_urdf_of(data, urdf) or FROM_DATA}"]
+    if body.base:
+        lines.append(f"mobile base: {', '.join(body.base)}")
     if not data.skin or not body.channels:
         lines.append("no touch in this dataset: a plain sequence memory")
     else:
-        kind = {1: "pressure", 3: "3 forces", 6: "wrench, a patch a direction"}[body.channels]
+        kind = {1: "pressure", 3: "3 forces", 6: "wrench"}[body.channels]
         unit = next(iter(data.skin.values())).unit
         sensors = body.readings // body.channels
         lines.append(f"touch: {sensors} cells x {kind}, {len(body.patches)} patches, unit: {unit}")
+    if body.observations:
+        bound = (f"{name} ({entries})" for name, entries in body.observations.items())
+        lines.append(f"bound besides: {', '.join(bound)}")
     return lines
 
 
 def limits_of(data: Dataset, urdf: Path | None = None) -> Limits:
     """Joint limits of a dataset; arguments and errors as in ``body_of``."""
-    source = _limits_source(data, urdf)
-    chosen = urdf or (asset_path("hsr.urdf") if source != FROM_DATA else None)
+    chosen = _urdf_of(data, urdf)
     if chosen is None:
-        lower, upper, speed = _range(data)
-        return Limits(*_widened(lower, upper, speed), source)
+        return Limits(*_widened(*_range(data)))
     joints = _urdf_joints(data, chosen)
     _check_units(data, joints, chosen)
     lower = np.array([joint.lower for joint in joints])
     upper = np.array([joint.upper for joint in joints])
     speed = np.array([joint.velocity for joint in joints])
-    if not np.isfinite([lower, upper, speed]).all():
-        least, most, fastest = _widened(*_range(data))
-        lower = np.where(np.isfinite(lower), lower, least)
-        upper = np.where(np.isfinite(upper), upper, most)
-        speed = np.where(np.isfinite(speed), speed, fastest)
+    free = ~np.isfinite(upper - lower)
+    lower[free], upper[free] = -np.inf, np.inf
+    if not np.isfinite(speed).all():
+        speed = np.where(np.isfinite(speed), speed, _widened(*_range(data))[2])
     _check_positions(data, joints, lower, upper, chosen)
     _check_speeds(data, joints, chosen)
-    return Limits(lower.tolist(), upper.tolist(), speed.tolist(), source)
+    return Limits(lower.tolist(), upper.tolist(), speed.tolist())
 
 
-FROM_DATA = "the range of the data"
-
-
-def _limits_source(data: Dataset, urdf: Path | None) -> str:
-    if urdf is not None:
-        return str(urdf)
-    bundled = read_urdf(asset_path("hsr.urdf")).joints
-    return "the bundled hsr.urdf" if all(j in bundled for j in data.joints) else FROM_DATA
+def _urdf_of(data: Dataset, urdf: Path | None) -> Path | None:
+    """The URDF by option, else the bundled one where it has the dataset's joints, else none."""
+    bundled = asset_path("hsr.urdf")
+    known = urdf is None and set(data.joints) <= set(read_urdf(bundled).joints)
+    return bundled if known else urdf
 
 
 def _urdf_joints(data: Dataset, urdf: Path) -> list[UrdfJoint]:
@@ -123,7 +172,7 @@ def _check_units(data: Dataset, joints: Iterable[UrdfJoint], urdf: Path) -> None
 def _check_positions(
     data: Dataset, joints: list[UrdfJoint], lower: np.ndarray, upper: np.ndarray, urdf: Path
 ) -> None:
-    span = upper - lower
+    span = np.where(np.isfinite(upper), upper - lower, 1.0)
     worst = np.full(len(joints), BEYOND)
     found: dict[int, tuple[Episode, int]] = {}
     for episode in data:
@@ -198,39 +247,11 @@ def _widened(
     return (lower - room).tolist(), (upper + room).tolist(), np.maximum(speed, slowest).tolist()
 
 
-def _body(data: Dataset, limits: Limits) -> Body:
-    patches = list((data.skin or {}).values())
-    names, cells, directions, links = [], [], [], []
-    for patch in patches:
-        for name, count, direction in _split(patch):
-            names.append(name.replace(".", "_"))
-            cells.append(count)
-            directions.append(direction)
-            links.append(patch.link or "")
-    if not patches:
-        names, cells, directions, links = ["sequence"], [1], [[0.0, 0.0, 1.0]], [""]
-    return Body(
-        joints=list(data.joints),
-        lower=limits.lower,
-        upper=limits.upper,
-        max_speed=limits.max_speed,
-        patches=names,
-        cells=cells,
-        directions=directions,
-        links=links,
-        rate=float(data.fps),
-        channels=patches[0].channels if patches else 0,
-    )
-
-
-def _split(patch: SkinPatch) -> list[tuple[str, int, list[float]]]:
-    """Name, cells and direction of the patches that a patch of the dataset becomes."""
+def _cells_of(patch: SkinPatch) -> list[list[float]]:
+    """Unit normal of each cell of a patch as the model takes it."""
     count = patch.cells.stop - patch.cells.start
     if patch.channels == WRENCH:
-        sensors = [patch.name] if count == 1 else [f"{patch.name}_{i}" for i in range(count)]
-        return [(f"{s} {name}", 1, list(d)) for s in sensors for name, d in DIRECTIONS.items()]
-    if patch.normals is None:
-        return [(patch.name, count, [0.0, 0.0, 1.0])]
-    normal = np.asarray(patch.normals, dtype=np.float64).mean(axis=0)
-    length = float(np.linalg.norm(normal))
-    return [(patch.name, count, (normal / length).tolist() if length else [0.0, 0.0, 1.0])]
+        return [list(push) for push in PUSHES] * count
+    normals = np.zeros((count, 3)) if patch.normals is None else np.array(patch.normals, float)
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(lengths > 0, normals / np.maximum(lengths, 1e-12), UPWARD).tolist()

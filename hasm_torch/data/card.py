@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hasm_torch.data.episodes import EpisodeSet, load_episodes
+from hasm_torch.episode import ACTION, STATE, TACTILE
 
 _FRONT_MATTER = """---
 license: apache-2.0
@@ -60,15 +61,17 @@ def _table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
 def _feature_table(data: EpisodeSet) -> str:
     units = ", ".join(dict.fromkeys(data.units))
     rows = [
-        ("`observation.state`", f"({len(data.joints)},)", units, "joint positions"),
-        ("`action`", f"({len(data.action_names)},)", units, "joint targets"),
+        (f"`{STATE}`", f"({len(data.joints)},)", units, "joint positions"),
+        (f"`{ACTION}`", f"({len(data.action_names)},)", units, "joint targets"),
     ]
     tactile = data.episodes[0].tactile
     if data.skin is not None and tactile is not None:
         unit = next(iter(data.skin.values())).unit
         cells, channels = tactile.shape[1:]
         text = f"skin readings, {cells} cells x {channels}, flat; geometry in the feature's `info`"
-        rows.insert(1, ("`observation.tactile`", f"({cells * channels},)", unit, text))
+        rows.insert(1, (f"`{TACTILE}`", f"({cells * channels},)", unit, text))
+    for key, entries in data.observations.items():
+        rows.append((f"`{key}`", f"({entries},)", "", "a further observation to bind"))
     rows += [
         ("`timestamp`", "(1,)", "s", f"time in the episode, {data.fps:g} frames per second"),
         ("`task_index`", "(1,)", "", "row of `meta/tasks.parquet`"),

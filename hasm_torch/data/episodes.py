@@ -1,7 +1,8 @@
 """Demonstrations of a LeRobot v3.0 dataset as arrays, one `Episode` each."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,10 @@ import numpy as np
 
 from hasm_torch.data.checks import (
     check_finite,
+    check_owner,
     check_spans,
     check_tasks,
     check_time,
-    flat,
 )
 from hasm_torch.data.skin import (
     UNKNOWN_UNIT,
@@ -21,7 +22,7 @@ from hasm_torch.data.skin import (
     skin_from_info,
     tactile_layout,
 )
-from hasm_torch.episode import Episode
+from hasm_torch.episode import ACTION, STATE, TACTILE, Episode
 
 
 @dataclass(eq=False)
@@ -36,6 +37,7 @@ class EpisodeSet:
         skin: Patches by name, or None without skin.
         root: Folder of the dataset.
         action_names: Names of the action's entries.
+        observations: Number of entries of each further observation that is bound, by feature.
     """
 
     episodes: list[Episode]
@@ -45,6 +47,7 @@ class EpisodeSet:
     skin: dict[str, SkinPatch] | None
     root: Path
     action_names: tuple[str, ...]
+    observations: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -59,13 +62,17 @@ class FeatureMap:
 
     Attributes:
         state: Joint positions.
-        tactile: Skin readings; None reads no skin, and a dataset without this feature has none.
+        tactile: Skin readings: cells x 3 forces, cells x 1 pressure, or wrenches of 6. None reads
+            no skin; a dataset may lack the usual feature, but not one of another name.
         action: Joint targets.
+        bound: Further observations to bind, such as an object's position; None takes those that
+            the dataset declares by ``"bind": true`` in the feature's ``info``.
     """
 
-    state: str = "observation.state"
-    tactile: str | None = "observation.tactile"
-    action: str = "action"
+    state: str = STATE
+    tactile: str | None = TACTILE
+    action: str = ACTION
+    bound: list[str] | None = None
 
 
 def load_episodes(
@@ -86,19 +93,16 @@ def load_episodes(
         ValueError: The dataset is of another format, empty or damaged, lacks a feature, or holds
             values that are not finite, of another shape than declared, or not at its frame rate.
     """
-    from hasm_torch.data import parquet  # loads pyarrow
-
-    plan = _plan(Path(root), features or FeatureMap())
-    columns = parquet.read_columns(plan.files, plan.shapes)
-    check_spans(plan.spans, plan.indices, columns["episode_index"], plan.root)
-    check_time(columns["timestamp"], plan.spans, plan.indices, plan.fps, tolerance_s)
-    tasks = np.array(parquet.read_tasks(plan.root), dtype=object)
-    episodes = []
-    for index, (start, stop) in zip(plan.indices, plan.spans, strict=True):
-        mine = {key: values[start:stop] for key, values in columns.items()}
-        episodes.append(_episode_of(plan, mine, int(index), tasks, tolerance_s))
+    stream = EpisodeStream(root, features, tolerance_s)
     return EpisodeSet(
-        episodes, plan.fps, plan.joints, plan.units, plan.skin, plan.root, plan.action_names
+        list(stream),
+        stream.fps,
+        stream.joints,
+        stream.units,
+        stream.skin,
+        stream.root,
+        stream.action_names,
+        stream.observations,
     )
 
 
@@ -127,6 +131,7 @@ class EpisodeStream:
         plan = self._plan
         self.fps, self.joints, self.units = plan.fps, plan.joints, plan.units
         self.skin, self.action_names = plan.skin, plan.action_names
+        self.observations = plan.observations
         self._tasks = np.array(parquet.read_tasks(self.root), dtype=object)
 
     def __len__(self) -> int:
@@ -136,33 +141,35 @@ class EpisodeStream:
     def nbytes(self) -> int:
         """Size of all frames in memory."""
         entries = sum(int(np.prod(shape)) for shape in self._plan.shapes.values())
-        return int(self._plan.spans[-1][1]) * entries * 8
+        return self._plan.spans[-1][1] * entries * 8
 
     def __iter__(self) -> Iterator[Episode]:
         from hasm_torch.data import parquet
 
         plan = self._plan
         groups = parquet.iterate_columns(plan.files, plan.shapes)
-        held = {key: np.empty((0, *shape)) for key, shape in plan.shapes.items()}
-        for index, (start, stop) in zip(plan.indices, plan.spans, strict=True):
-            count = int(stop - start)
-            parts, rows = [held], len(held["timestamp"])
-            while rows < count:
+        parts: list[dict[str, np.ndarray]] = []
+        for index, (start, stop) in zip(plan.indices.tolist(), plan.spans, strict=True):
+            while (rows := sum(len(part["timestamp"]) for part in parts)) < stop - start:
                 part = next(groups, None)
                 if part is None:
-                    raise ValueError(
-                        f"Expected {count} frames of episode {index} in {self.root}/data as "
-                        f"meta/episodes says, got {rows}. The recording was cut off or the files "
-                        "were changed."
-                    )
+                    raise self._incomplete(start + rows)
                 parts.append(part)
-                rows += len(part["timestamp"])
-            filled = [part for part in parts if len(part["timestamp"])]
-            joined = {key: np.concatenate([part[key] for part in filled]) for key in held}
-            held = {key: values[count:] for key, values in joined.items()}
-            mine = {key: values[:count] for key, values in joined.items()}
-            check_spans([(0, count)], np.array([index]), mine["episode_index"], self.root)
-            yield _episode_of(plan, mine, int(index), self._tasks, self._tolerance_s)
+            if len(parts) > 1:
+                parts = [{key: np.concatenate([p[key] for p in parts]) for key in parts[0]}]
+            mine = {key: values[: stop - start] for key, values in parts[0].items()}
+            parts = [{key: values[stop - start :] for key, values in parts[0].items()}]
+            check_owner(mine["episode_index"], index, start, self.root)
+            yield _episode_of(plan, mine, index, self._tasks, self._tolerance_s)
+        more = sum(len(part["timestamp"]) for part in (*parts, *groups))
+        if more:
+            raise self._incomplete(plan.spans[-1][1] + more)
+
+    def _incomplete(self, frames: int) -> ValueError:
+        return ValueError(
+            f"Expected {self._plan.spans[-1][1]} frames in {self.root}/data as meta/episodes says, "
+            f"got {frames}. The recording was cut off or the files were changed."
+        )
 
 
 def open_episodes(
@@ -182,11 +189,6 @@ def open_episodes(
     return stream if stream.nbytes > most_bytes else load_episodes(root, features)
 
 
-def iter_episodes(root: str | Path, features: FeatureMap | None = None) -> Iterator[Episode]:
-    """The episodes of a dataset, one at a time; see `EpisodeStream`."""
-    return iter(EpisodeStream(root, features))
-
-
 @dataclass(eq=False)
 class _Plan:
     """What ``meta`` says about a dataset: where its episodes lie and what its columns mean."""
@@ -201,6 +203,7 @@ class _Plan:
     declared: Mapping[str, Any]
     layout: tuple[int, int] | None
     skin: dict[str, SkinPatch] | None
+    observations: dict[str, int]
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -220,13 +223,20 @@ def _plan(root: Path, names: FeatureMap) -> _Plan:
 
     info = parquet.read_info(root)
     declared = info["features"]
-    tactile = names.tactile if names.tactile in declared else None
-    keys = [names.state, names.action, *([tactile] if tactile else [])]
+    tactile = names.tactile
+    if tactile == TACTILE and tactile not in declared:
+        tactile = None
+    used = (names.state, names.action, tactile)
+    bound = names.bound
+    if bound is None:
+        wanted = (key for key in declared if (declared[key].get("info") or {}).get("bind"))
+        bound = [key for key in wanted if key not in used]
+    keys = [key for key in (*used, *bound) if key]
     shapes: dict[str, tuple[int, ...]] = {key: _shape(declared, key, root) for key in keys}
     rows = parquet.read_episode_rows(root)
-    spans = list(zip(rows["dataset_from_index"], rows["dataset_to_index"], strict=True))
-    if not spans:
-        raise ValueError(f"Expected at least one episode in {root}, got none.")
+    borders = (rows[f"dataset_{end}_index"].tolist() for end in ("from", "to"))
+    spans = list(zip(*borders, strict=True))
+    check_spans(spans, root)
     layout = tactile_layout(declared[tactile], tactile) if tactile else None
     return _Plan(
         root=root,
@@ -239,6 +249,7 @@ def _plan(root: Path, names: FeatureMap) -> _Plan:
         declared=declared,
         layout=layout,
         skin=skin_from_info(declared[tactile], *layout, tactile) if tactile and layout else None,
+        observations={key: prod(shapes[key]) for key in bound},
     )
 
 
@@ -250,22 +261,28 @@ def _episode_of(
     tolerance_s: float,
 ) -> Episode:
     """One episode from its own rows, checked."""
-    names, spans, indices = plan.names, [(0, len(columns["timestamp"]))], np.array([index])
-    check_time(columns["timestamp"], spans, indices, plan.fps, tolerance_s)
-    for key in (names.state, names.action, *([names.tactile] if plan.layout else [])):
-        columns[str(key)] = columns[str(key)].astype(np.float32, copy=False)
-        check_finite(columns[str(key)], str(key), spans, indices)
+    names, length = plan.names, len(columns["timestamp"])
+    check_time(columns["timestamp"], index, plan.fps, tolerance_s)
+    skin = [str(names.tactile)] if plan.layout else []
+    for key in (names.state, names.action, *skin, *plan.observations):
+        columns[key] = columns[key].astype(np.float32)  # a copy: what Arrow gives is read-only
+        check_finite(columns[key], key, index)
     check_tasks(columns["task_index"], tasks, plan.root)
     return Episode(
         index=index,
         # an episode with several tasks names them in the order in which they come up
         task="; ".join(dict.fromkeys(tasks[columns["task_index"]])),
-        time=columns["timestamp"],
-        state=flat(columns[names.state]),
-        action=flat(columns[names.action]),
+        time=columns["timestamp"].copy(),
+        state=columns[names.state].reshape(length, -1),
+        action=columns[names.action].reshape(length, -1),
         tactile=None
         if plan.layout is None
         else columns[str(names.tactile)].reshape(-1, *plan.layout),
+        observations=np.concatenate(
+            [columns[key].reshape(length, -1) for key in plan.observations], axis=1
+        )
+        if plan.observations
+        else None,
     )
 
 

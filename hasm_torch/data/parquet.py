@@ -1,8 +1,8 @@
 """Whole columns of a LeRobot v3.0 dataset as NumPy arrays, straight from its parquet files."""
 
+import contextlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -44,30 +44,22 @@ def read_info(root: Path) -> dict[str, Any]:
     return info
 
 
-def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """A parquet file, or some of its columns.
+@contextlib.contextmanager
+def _opened(path: Path, columns: Sequence[str] = ()) -> Iterator[pq.ParquetFile]:
+    """A parquet file with these columns.
 
     Raises:
         FileNotFoundError: The file is missing.
         ValueError: The file is damaged, or lacks a column.
     """
-    names = None if columns is None else list(columns)
-    return _open(path, lambda file: file.read(columns=names), names)
-
-
-def _open[Found](
-    path: Path, read: Callable[[pq.ParquetFile], Found], columns: Sequence[str] | None = None
-) -> Found:
-    """What `read` finds in a parquet file; errors as in `read_table`."""
     if not path.is_file():
         raise FileNotFoundError(f"The dataset is incomplete: {path} is missing.")
     try:
         with pq.ParquetFile(path) as file:
-            missing = set(columns or ()) - set(file.schema_arrow.names)
-            if missing:
+            if missing := set(columns) - set(file.schema_arrow.names):
                 found = file.schema_arrow.names
                 raise ValueError(f"Expected columns {sorted(missing)} in {path}, found {found}.")
-            return read(file)
+            yield file
     except (pa.ArrowException, OSError) as error:
         raise ValueError(
             f"{path} ({path.stat().st_size} bytes) is empty, truncated or damaged: {error}. "
@@ -79,10 +71,11 @@ def read_tasks(root: Path) -> list[str]:
     """The task strings of a dataset in the order of their rows.
 
     Raises:
-        FileNotFoundError, ValueError: see `read_table`.
+        FileNotFoundError, ValueError: The file is missing, damaged, or lacks its column.
     """
     path = root / "meta" / "tasks.parquet"
-    table = read_table(path)
+    with _opened(path) as file:
+        table = file.read()
     # pandas names the column of an unnamed index __index_level_0__
     names = [name for name in ("task", "__index_level_0__") if name in table.column_names]
     if not names:
@@ -94,7 +87,7 @@ def read_episode_rows(root: Path) -> dict[str, np.ndarray]:
     """Where each episode's frames lie: one row an episode, in the order of their frames.
 
     Raises:
-        FileNotFoundError, ValueError: see `read_table`.
+        FileNotFoundError, ValueError: see `iterate_columns`.
     """
     columns = ["episode_index", "dataset_from_index", "dataset_to_index"]
     columns += ["data/chunk_index", "data/file_index"]
@@ -102,49 +95,37 @@ def read_episode_rows(root: Path) -> dict[str, np.ndarray]:
     paths = sorted(folder.glob("*/*.parquet"))
     if not paths:
         raise FileNotFoundError(f"The dataset is incomplete: no parquet file below {folder}.")
-    rows = read_columns(paths, {column: () for column in columns})
+    parts = list(iterate_columns(paths, {column: () for column in columns}))
+    empty = [{column: np.zeros(0, np.int64) for column in columns}]
+    rows = {c: np.concatenate([part[c] for part in empty + parts]) for c in columns}
     order = np.argsort(rows["dataset_from_index"], kind="stable")
     return {column: values[order].astype(np.int64) for column, values in rows.items()}
-
-
-def read_columns(
-    paths: Sequence[Path], shapes: Mapping[str, tuple[int, ...]]
-) -> dict[str, np.ndarray]:
-    """Columns of several files, one after the other.
-
-    Args:
-        paths: Files in the order of their frames.
-        shapes: Shape of one frame's entry, by column.
-
-    Returns:
-        Arrays of shape (frames, *shape), by column.
-
-    Raises:
-        FileNotFoundError, ValueError: see `read_table` and `to_array`.
-    """
-    tables = [read_table(path, list(shapes)) for path in paths]
-    parts = [(table, str(path)) for table, path in zip(tables, paths, strict=True)]
-    return {
-        key: np.concatenate([to_array(t.column(key), shape, f"{key!r} in {p}") for t, p in parts])
-        for key, shape in shapes.items()
-    }
 
 
 def iterate_columns(
     paths: Sequence[Path], shapes: Mapping[str, tuple[int, ...]]
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Columns of several files, one row group after the other; arguments as in `read_columns`."""
+    """Columns of several files, one row group after the other.
+
+    Args:
+        paths: Files in the order of their frames.
+        shapes: Shape of one frame's entry, by column.
+
+    Yields:
+        Arrays of shape (frames, *shape), by column.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        ValueError: A file is damaged, lacks a column, or see `to_array`.
+    """
     for path in paths:
-        for group in range(_open(path, lambda file: file.num_row_groups, list(shapes))):
-            table = _open(path, partial(_read_group, group=group, columns=list(shapes)))
-            yield {
-                key: to_array(table.column(key), shape, f"{key!r} in {path}")
-                for key, shape in shapes.items()
-            }
-
-
-def _read_group(file: pq.ParquetFile, group: int, columns: list[str]) -> pa.Table:
-    return file.read_row_group(group, columns=columns)
+        with _opened(path, list(shapes)) as file:
+            for group in range(file.num_row_groups):
+                table = file.read_row_group(group, columns=list(shapes))
+                yield {
+                    key: to_array(table.column(key), shape, f"{key!r} in {path}")
+                    for key, shape in shapes.items()
+                }
 
 
 def to_array(column: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from hasm_torch.data.episodes import Episode
-from hasm_torch.data.skin import SkinPatch, skin_to_info
+from hasm_torch.data.skin import UNKNOWN_UNIT, SkinPatch, skin_to_info
+from hasm_torch.episode import ACTION, STATE, TACTILE, Episode
 
-STATE, TACTILE, ACTION = "observation.state", "observation.tactile", "action"
+Entries = Sequence[str] | Mapping[str, str]  # names, or names with their units
 
 
 def write_episodes(
@@ -24,6 +24,7 @@ def write_episodes(
     skin: Mapping[str, SkinPatch] | None,
     fps: int,
     robot_type: str,
+    observations: Mapping[str, Entries] | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Writes demonstrations as a LeRobot v3.0 dataset.
@@ -40,6 +41,8 @@ def write_episodes(
         skin: Patches by name that cover all cells in order, or None for episodes without skin.
         fps: Frames per second, a whole number.
         robot_type: Robot the demonstrations come from.
+        observations: Further observations to bind: names of the entries, or their units by name,
+            of each feature, in the order of ``Episode.observations``.
         overwrite: Replace the dataset at ``root``; the old one stays until the new one is whole.
 
     Returns:
@@ -58,11 +61,12 @@ def write_episodes(
         )
     if int(fps) != fps or fps < 1:
         raise ValueError(f"Expected a whole number of frames per second, got fps={fps}.")
-    frames = _checked(episodes, len(joints), skin, int(fps))
+    bound = dict(observations or {})
+    frames = _checked(episodes, len(joints), skin, bound, int(fps))
     first = next(frames, None)
     if first is None:
         raise ValueError("Expected at least one episode to write, got none.")
-    features = _features(first, tuple(joints), tuple(units), skin)
+    features = _features(first, tuple(joints), tuple(units), skin, bound)
 
     root.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=root.parent, prefix=f".{root.name}.") as folder:
@@ -111,6 +115,7 @@ def _features(
     joints: tuple[str, ...],
     units: tuple[str, ...],
     skin: Mapping[str, SkinPatch] | None,
+    bound: Mapping[str, Entries],
 ) -> dict[str, dict[str, Any]]:
     vector = {"dtype": "float32", "shape": (len(joints),), "names": list(joints)}
     features: dict[str, dict[str, Any]] = {
@@ -130,6 +135,14 @@ def _features(
             ],
             "info": skin_to_info(skin, cells, channels),
         }
+    for key, entries in bound.items():
+        known = entries if isinstance(entries, Mapping) else dict.fromkeys(entries, UNKNOWN_UNIT)
+        features[key] = {
+            "dtype": "float32",
+            "shape": (len(known),),
+            "names": list(known),
+            "info": {"bind": True, "units": list(known.values())},
+        }
     return features
 
 
@@ -137,6 +150,7 @@ def _checked(
     episodes: Iterable[Episode],
     joints: int,
     skin: Mapping[str, SkinPatch] | None,
+    bound: Mapping[str, Entries],
     fps: int,
 ) -> Iterator[dict[str, Any]]:
     """The columns of each episode, checked: a dataset never holds what could not be read back."""
@@ -149,11 +163,15 @@ def _checked(
             STATE: _column(episode.state, (length, joints), STATE, number),
             ACTION: _column(episode.action, (length, joints), ACTION, number),
         }
-        if (episode.tactile is None) != (skin is None):
-            raise ValueError(
-                f"Episode {number}: expected tactile readings exactly where a skin is described, "
-                f"got tactile {_came(episode.tactile)} and skin {_came(skin)}."
-            )
+        for what, values, described in (
+            ("tactile", episode.tactile, skin),
+            ("observations", episode.observations, bound or None),
+        ):
+            if (values is None) != (described is None):
+                raise ValueError(
+                    f"Episode {number}: expected {what} exactly where they are described, got "
+                    f"{what} {_came(values)} and their description {_came(described)}."
+                )
         if skin is not None and episode.tactile is not None:
             if layout is None:
                 layout = np.shape(episode.tactile)[1:]
@@ -164,6 +182,11 @@ def _checked(
                     )
             tactile = _column(episode.tactile, (length, *layout), TACTILE, number)
             columns[TACTILE] = tactile.reshape(length, -1)
+        if bound and episode.observations is not None:
+            ends = np.cumsum([len(entries) for entries in bound.values()])
+            name = ", ".join(bound)
+            values = _column(episode.observations, (length, int(ends[-1])), name, number)
+            columns |= dict(zip(bound, np.split(values, ends[:-1], axis=1)))
         _check_time(np.asarray(episode.time, dtype=np.float64), length, fps, number)
         yield {**columns, "task": episode.task, "layout": layout}
 

@@ -1,10 +1,11 @@
 """Skin readings of any layout as the forces of cells.
 
 A cell gives three normal forces (the paper's skin), one pressure, or a wrench (fx, fy, fz, tx, ty,
-tz). A pressure is the first of three forces. A wrench becomes six cells, one a direction +x, -x,
-+y, -y, +z, -z of its sensor, each with the force that pushes that way, so that direction and
-strength reach the memory as those of six patches; its torques are left aside. A robot without skin
-has one cell that is touched steadily, so that its memory plays back sequences at their own pace.
+tz). A pressure is the first of three forces. A wrench becomes six cells of its patch, one each way
+along its sensor's axes, each with the force that pushes that way: their normals weighted by their
+forces add up to the direction of the force, as those of a curved patch do. Its torques are left
+aside. A robot without skin has one cell that is touched steadily, so that its memory plays back
+sequences at their own pace.
 """
 
 import functools
@@ -18,14 +19,15 @@ from hasm_torch.body import Body
 
 FORCES, PRESSURE, WRENCH = 3, 1, 6
 STEADY_FORCE = 8.0  # N, that touches a robot without skin
-DIRECTIONS = {
-    "+x": (1.0, 0.0, 0.0),
-    "-x": (-1.0, 0.0, 0.0),
-    "+y": (0.0, 1.0, 0.0),
-    "-y": (0.0, -1.0, 0.0),
-    "+z": (0.0, 0.0, 1.0),
-    "-z": (0.0, 0.0, -1.0),
-}
+# Outward normals of the six cells that a wrench becomes: a push along +x meets the one facing -x.
+PUSHES = (
+    (-1.0, 0.0, 0.0),
+    (1.0, 0.0, 0.0),
+    (0.0, -1.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (0.0, 0.0, -1.0),
+    (0.0, 0.0, 1.0),
+)
 
 
 def as_forces(readings: Tensor) -> Tensor:
@@ -35,8 +37,8 @@ def as_forces(readings: Tensor) -> Tensor:
         readings: (..., cells, channels) with 3, 1 or 6 channels.
 
     Returns:
-        (..., cells, 3), or (..., 6 · cells, 3) for wrenches, in the order of ``DIRECTIONS`` for
-        each cell.
+        (..., cells, 3), or (..., 6 · cells, 3) for wrenches, in the order of ``PUSHES`` for each
+        cell.
 
     Raises:
         ValueError: If a cell has another number of channels.

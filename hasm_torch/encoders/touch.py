@@ -9,7 +9,9 @@
 sum runs over all cells of the patch, since a patch has one neuron.
 """
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hasm_torch.encoders.bipolar import to_bipolar
@@ -52,11 +54,11 @@ def effective_force(forces: Tensor, threshold: float, window: int) -> Tensor:
     return nn.functional.pad(total, (window - 1, 0)).unfold(-1, window, 1).sum(-1)
 
 
-def spike_density(rate: Tensor, max_rate: float) -> Tensor:
+def spike_density[Rate: (Tensor, NDArray[np.float64])](rate: Rate, max_rate: float) -> Rate:
     """Spike rate density rho = clamp(r_f / R, 0, 1).
 
     Args:
-        rate: (...), spikes/s.
+        rate: (...), spikes/s, a tensor or an array.
         max_rate: R, spikes/s.
 
     Returns:
@@ -67,7 +69,7 @@ def spike_density(rate: Tensor, max_rate: float) -> Tensor:
     """
     if not max_rate > 0:
         raise ValueError(f"expected max_rate > 0 spikes/s, got {max_rate}")
-    return (rate / max_rate).clamp(0, 1)
+    return (rate / max_rate).clip(0, 1)
 
 
 def tactile_embedding(rho: Tensor, levels: Tensor, bits: int) -> Tensor:

@@ -1,17 +1,21 @@
-"""Experiment 2, tactile-guided grasp: one patch reaches, another grasps and retracts.
+"""Experiment 3, tactile-guided grasp: one patch reaches, another grasps and retracts.
 
-Section "Multi-joint Action Sequence" of the paper.
+Section "Multi-joint Action Sequence" of the paper. What a touch does is named by its patch here,
+not by the direction of the force, so ``along_force`` means nothing and is not measured.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from hasm_torch.evaluation.rollout import Array, Policy, Trace, limit_violations, roll_out
+from hasm_torch.evaluation.rollout import Array, Human, Policy, Trace, limit_violations, roll_out
+from hasm_torch.sim.tasks import GRASP_PATCH, REACH_PATCH, START_NOISE, START_POSES, noisy_start
 
-REACH_PATCH, GRASP_PATCH = "wrist_upper", "wrist_right"
+FORCES = (3.0, 12.0)  # N, from which a touch is drawn
+PLACE_NOISE = 0.01  # m, of the object about its usual place
+PAUSES = 3  # of the human in a grasp
 LIFTED = 0.05  # m above the table
 SETTLED_AFTER = 0.3  # s from the finger's leaving until the robot must hold still
 # A human takes a motion as finished after so long a touch without motion, s, and longer for a soft
@@ -19,10 +23,9 @@ SETTLED_AFTER = 0.3  # s from the finger's leaving until the robot must hold sti
 STALLED_AFTER, SOFT_PATIENCE = 0.8, 7.0
 STALLED_BELOW = 2e-3  # rad or m
 TIME_LIMIT = 60.0  # s
-LIFT_NOISE_SHARE = 0.2  # noise of the arm lift, m, for each rad of the other joints' noise
 
 
-class Guide:
+class Guide(Human):
     """A human who reaches by one patch, then grasps by another, and leaves at random moments.
 
     Args:
@@ -44,25 +47,25 @@ class Guide:
         self.moved_at = 0.0
         self.anchor: Array | None = None
 
-    def touch(self, time: float, state: Array) -> tuple[str | None, float]:
+    def touches(self, time: float, state: Array) -> dict[str, tuple[float, int | None]]:
         """Press the current stage's patch, unless it is time for a pause."""
         if time < self.resume or not self.stages:
             self.last = time
-            return None, 0.0
+            return {}
         self.touched += time - self.last
         self.last = time
         if self.moments and self.touched >= self.moments[0]:
             self.moments.pop(0)
             self._leave(time, self.lengths.pop(0))
-            return None, 0.0
+            return {}
         if self.anchor is None or np.abs(state - self.anchor).max() > STALLED_BELOW:
             self.anchor, self.moved_at = state, self.touched
         if self.touched - self.moved_at > STALLED_AFTER + SOFT_PATIENCE / self.force:
             self.stages.pop(0)
             self.anchor = None
             self._leave(time, 0.5)
-            return None, 0.0
-        return self.stages[0], self.force
+            return {}
+        return {self.stages[0]: (self.force, None)}
 
     def finished(self, time: float, state: Array) -> bool:
         """After both stages, or when patience ends."""
@@ -73,64 +76,59 @@ class Guide:
         self.pauses.append((time, self.resume))
 
 
-@dataclass
+@dataclass(frozen=True)
 class GraspCase:
     """One rollout to be made.
 
     Attributes:
-        seed: Seed of force, pauses, start state and object.
+        seed: Seed of pauses and start state.
+        force: Force of the touch, N.
+        place: Displacement of the object from its usual place in x and y, m.
         pauses: Number of random pauses.
-        start_noise: Standard deviation of the start state's noise, rad; the arm lift gets a
-            fifth of it in m (0.05 rad: 1 cm).
-        object_noise: The object stands up to this far from its place in x and y, m.
-        force: Force of the touch, N; None draws it from 3 to 12 N.
+        start_noise: Standard deviation of the start state's noise, see ``tasks.noisy_start``.
     """
 
     seed: int
-    pauses: int
-    start_noise: float
-    object_noise: float
-    force: float | None
+    force: float
+    place: tuple[float, float] = (0.0, 0.0)
+    pauses: int = PAUSES
+    start_noise: float = START_NOISE
 
 
 def cases(
     rollouts: int,
-    forces: list[float],
     seed: int,
-    pauses: int,
-    start_noise: float,
-    object_noise: float,
+    forces: Sequence[float] = (),
+    object_noise: float = PLACE_NOISE,
+    pauses: int = PAUSES,
+    start_noise: float = START_NOISE,
 ) -> list[GraspCase]:
-    """Plan the rollouts; without forces each draws its own."""
+    """Plan the rollouts.
+
+    Args:
+        rollouts: How many.
+        seed: Seed of everything that is drawn.
+        forces: Forces to take in turn, N; by default drawn from ``FORCES``.
+        object_noise: The object stands anywhere up to this far from its place in x and y, m.
+        pauses: Number of random pauses.
+        start_noise: Noise of the start state, rad.
+    """
     rng = np.random.default_rng(seed)
-    return [
-        GraspCase(
-            int(rng.integers(2**31)),
-            pauses,
-            start_noise,
-            object_noise,
-            forces[i % len(forces)] if forces else None,
-        )
-        for i in range(rollouts)
-    ]
-
-
-def noisy_start(
-    home: Array, noise: float, lower: Array, upper: Array, rng: np.random.Generator
-) -> Array:
-    """A start state near the usual one; the first joint is the arm lift, in m."""
-    scale = np.full(len(home), noise)
-    scale[0] = LIFT_NOISE_SHARE * noise
-    return np.clip(home + scale * rng.standard_normal(len(home)), lower, upper)
+    planned = []
+    for i in range(rollouts):
+        force = forces[i % len(forces)] if forces else float(rng.uniform(*FORCES))
+        x, y = rng.uniform(-object_noise, object_noise, 2).tolist()
+        case = GraspCase(int(rng.integers(2**31)), force, (x, y), pauses, start_noise)
+        planned.append(case)
+    return planned
 
 
 def run_case(
     case: GraspCase,
     env: Any,
     policy: Policy,
-    home: Array,
-    frame_every: int = 0,
-    watch: Callable[[Policy], None] | None = None,
+    watch: Callable[[], None] | None = None,
+    start: Array | None = None,
 ) -> tuple[Trace, dict[str, Any]]:
     """Roll one case out and measure it.
 
@@ -138,47 +136,65 @@ def run_case(
         case: The case.
         env: The "grasp" environment.
         policy: The policy.
-        home: (joints,) usual start state, rad or m.
-        frame_every: Take a picture every so many steps; 0 takes none.
-        watch: Called with the policy after every step.
+        watch: Called after every step.
+        start: (joints,) start posture in place of the usual one, to which the case adds noise,
+            rad or m.
 
     Returns:
         The trace and its figures: ``success``, ``height`` (m above the table at the end),
         ``hold_drift`` (rad or m, largest motion of a joint in a pause after its first 0.3 s),
-        ``force`` (N), ``seconds``, ``violations``.
+        ``force`` (N), ``place`` (m), ``seconds``, ``violations``.
     """
     sim = env.unwrapped
+    limits = (sim.joint_lower, sim.joint_upper)
     rng = np.random.default_rng(case.seed)
-    force = case.force if case.force is not None else float(rng.uniform(3.0, 12.0))
-    guide = Guide(force, case.pauses, rng)
-    start = noisy_start(home, case.start_noise, sim.joint_lower, sim.joint_upper, rng)
-    x, y = rng.uniform(-case.object_noise, case.object_noise, 2)
-    trace = roll_out(env, policy, guide, start, case.seed, (x, y), frame_every, watch)
-    height = float(trace.object_height[-1])
+    guide = Guide(case.force, case.pauses, rng)
+    home = np.array(START_POSES["grasp"]) if start is None else start
+    begin = noisy_start(home, case.start_noise, *limits, rng)
+    trace = roll_out(env, policy, guide, begin, case.seed, case.place, watch)
+    height = float(trace.height[-1])
     drift = 0.0
-    for begin, end in guide.pauses:
-        held = (trace.time >= begin + SETTLED_AFTER) & (trace.time <= end)
+    for left, resumed in guide.pauses:
+        held = (trace.time >= left + SETTLED_AFTER) & (trace.time <= resumed)
         if held.any():
             drift = max(drift, float(np.ptp(trace.state[held], axis=0).max()))
     return trace, {
         "success": bool(trace.success and height >= LIFTED),
         "height": height,
         "hold_drift": drift,
-        "force": force,
+        "force": case.force,
+        "place": list(case.place),
         "seconds": float(trace.time[-1]),
-        "violations": limit_violations(
-            trace, sim.joint_lower, sim.joint_upper, sim.joint_speed_limit
-        ),
+        "violations": limit_violations(trace, *limits, sim.joint_speed_limit),
     }
 
 
-def summarise(figures: list[dict[str, Any]]) -> dict[str, Any]:
-    """The figures over all grasp rollouts."""
-    return {
+Figures = Sequence[dict[str, Any]]
+
+
+def summarise(figures: Figures, moved: Mapping[str, Figures]) -> dict[str, Any]:
+    """The figures over all grasp rollouts.
+
+    Args:
+        figures: Of the object near its usual place.
+        moved: Of the object elsewhere, by its largest offset, m.
+    """
+    found: dict[str, Any] = {
         "rollouts": len(figures),
-        "success_rate": float(np.mean([f["success"] for f in figures])),
+        "success_rate": _success(figures),
         "hold_drift_rad": float(np.max([f["hold_drift"] for f in figures])),
         "limit_violations": int(sum(f["violations"] for f in figures)),
         "mean_seconds": float(np.mean([f["seconds"] for f in figures])),
-        "results": figures,
+        "results": list(figures),
     }
+    if moved:
+        found["moved"] = {reach: _success(some) for reach, some in moved.items()}
+        found["moved_results"] = {
+            reach: [[*f["place"], float(f["success"])] for f in some]
+            for reach, some in moved.items()
+        }
+    return found
+
+
+def _success(figures: Figures) -> float:
+    return float(np.mean([f["success"] for f in figures]))

@@ -1,5 +1,9 @@
 """Open-loop prediction: where will the joints be, in episodes that were not learned?
 
+Judged is the model that rolls out, fitted with a horizon of the frames ahead. One that touch moves
+is stepped on from a frame with its skin as it is felt then, which takes longer, so that of each
+episode ``STEPPED`` frames are predicted.
+
 The error of a joint is the root mean square over all held-out frames of predicted less real
 position, divided by that of standing still, which predicts the present position: 1 is no better
 than that. Over all joints, squared errors are first divided by the square of the joint's range
@@ -8,34 +12,38 @@ in the dataset, so that degrees, radians and metres add up.
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
-from hasm_torch.apps.training import DatasetConfig, FeaturesConfig, RobotConfig
 from hasm_torch.body import Body
-from hasm_torch.config import write_json
+from hasm_torch.config import HASMConfig, write_json
 from hasm_torch.data.body import body_of, describe_body
-from hasm_torch.data.episodes import Episode, EpisodeSet, FeatureMap, load_episodes
-from hasm_torch.prediction.neighbours import NEIGHBOURS, NeighbourRegression, NeighbourSettings
-from hasm_torch.prediction.predictor import JointPredictor
-from hasm_torch.prediction.selection import choose_neighbours, choose_settings, frames_back
-from hasm_torch.prediction.series import Series, TouchRates, moments
-from hasm_torch.prediction.settings import PredictionSettings
+from hasm_torch.data.episodes import EpisodeSet, FeatureMap, load_episodes
+from hasm_torch.data.training import DatasetConfig, Method, RobotConfig, settings
+from hasm_torch.evaluation.opponents import tuned
+from hasm_torch.model.fit import timed_series
+from hasm_torch.model.hasm import HASM
+from hasm_torch.model.moments import moments
 
 if TYPE_CHECKING:
-    from hasm_torch.evaluation.evaluate import EvalConfig
+    from hasm_torch.evaluation.options import EvalConfig
 
 Array = np.ndarray
 
+CONTESTANTS = ("hasm", "ridge", "neighbours")
+
 # Joints and seconds that the plot shows.
 PLOT_JOINTS, PLOT_SECONDS = 6, 20.0
+
+
+# Frames of an episode that are predicted where touch moves the robot.
+STEPPED = 60
 
 
 @dataclass
@@ -46,8 +54,8 @@ class OpenLoopConfig:
         dataset: Which dataset.
         features: Which of its features are read.
         robot: Which robot recorded it.
-        method: "default" chooses the settings within the learned episodes; "literal" is the
-            paper as written.
+        method: "default", with the settings under ``model``, or "literal", the paper as written.
+        model: Settings of the method; the horizon is that of the prediction.
         folds: Parts into which the episodes are split; each is predicted by the others.
         horizon_s: How far ahead, s, beside one frame ahead.
         seed: Seed of the split.
@@ -55,9 +63,10 @@ class OpenLoopConfig:
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    features: FeaturesConfig = field(default_factory=FeaturesConfig)
+    features: FeatureMap = field(default_factory=FeatureMap)
     robot: RobotConfig = field(default_factory=RobotConfig)
-    method: Literal["default", "literal"] = "default"
+    method: Method = "default"
+    model: HASMConfig = field(default_factory=HASMConfig)
     folds: int = 5
     horizon_s: float = 0.5
     seed: int = 0
@@ -74,22 +83,18 @@ class Predicted:
     """Held-out frames of one fold, K of them, as displacements from the present state.
 
     Attributes:
-        hasm: (K, J) predicted by the memory.
-        knn: (K, J) predicted by the nearest neighbours.
+        by: (K, J) predicted by each contestant.
         real: (K, J) what came.
         state: (K, J) the present state.
         episode: (K,) index of the episode in the dataset.
-        frame: (K,) frame of the episode.
-        settings: What was chosen for the memory and for the neighbours.
+        choices: What was chosen for the memory.
     """
 
-    hasm: Tensor
-    knn: Tensor
-    real: Tensor
-    state: Tensor
-    episode: Tensor
-    frame: Tensor
-    settings: dict[str, Any]
+    by: dict[str, Array]
+    real: Array
+    state: Array
+    episode: Array
+    choices: dict[str, str]
 
 
 def open_loop(config: OpenLoopConfig) -> dict[str, Any]:
@@ -110,7 +115,7 @@ def open_loop(config: OpenLoopConfig) -> dict[str, Any]:
     if not config.horizon_s > 0:
         raise ValueError(f"horizon_s must be above 0 s, got {config.horizon_s}")
     begin = time.perf_counter()
-    data = load_episodes(config.dataset.root, FeatureMap(**asdict(config.features)))
+    data = load_episodes(config.dataset.root, config.features)
     whole = body_of(data, config.robot.urdf)
     for line in describe_body(data, whole, config.robot.urdf):
         print(line)
@@ -164,47 +169,35 @@ def predict_fold(
         data: The dataset.
         held_out: Numbers of the episodes to predict.
         horizon: Frames ahead.
-        config: Method, URDF and seed.
+        config: Method, settings and URDF.
 
     Raises:
         ValueError: If the episodes are too short for the horizon.
     """
     out = set(held_out)
     learned = [episode for i, episode in enumerate(data) if i not in out]
-    unseen = [data.episodes[i] for i in held_out]
+    unseen = [data.episodes[i] for i in held_out if len(data.episodes[i]) > horizon]
     body = body_of(replace(data, episodes=learned), config.robot.urdf)
-    rates = TouchRates(body, learned)
-    known = [rates(episode) for episode in learned]
-    asked = [rates(episode) for episode in unseen]
-    if config.method == "literal":
-        settings = PredictionSettings.literal(len(body.joints))
-    else:
-        settings = choose_settings(known, body, horizon, np.random.default_rng(config.seed))
-    rivals = choose_neighbours(known, body, horizon, np.random.default_rng(config.seed))
-    return _predict(known, asked, unseen, body, horizon, settings, rivals)
-
-
-def _predict(
-    known: list[Series],
-    asked: list[Series],
-    unseen: list[Episode],
-    body: Body,
-    horizon: int,
-    settings: PredictionSettings,
-    rivals: NeighbourSettings,
-) -> Predicted:
-    lag = frames_back(settings.context_s, body.rate)
-    mine = moments(asked, lag, horizon)
-    hasm = JointPredictor(settings, body, moments(known, lag, horizon))(mine)
-    lag = frames_back(rivals.context_s, body.rate)
-    knn = NeighbourRegression(rivals, moments(known, lag, horizon))(moments(asked, lag, horizon))
-    index = torch.tensor([episode.index for episode in unseen])
-    chosen = {"hasm": asdict(settings), "knn": asdict(rivals)}
-    return Predicted(hasm, knn, mine.target, mine.state, index[mine.episode], mine.frame, chosen)
+    method = replace(settings(config.method, config.model), horizon=horizon)
+    model = HASM(method, body)
+    report = model.fit(learned)
+    assert model.settled is not None
+    most = 10**9 if model.settled.drive == "time" else STEPPED
+    mine, frames = zip(*(model.predict(episode, horizon, most) for episode in unseen))
+    by = {"hasm": np.concatenate(mine)}
+    series = [timed_series(method, body, model.settled, e, i) for i, e in enumerate(learned)]
+    asked = [timed_series(method, body, model.settled, e, i) for i, e in enumerate(unseen)]
+    starts = np.cumsum([0, *(len(e) - horizon for e in unseen)])[:-1]
+    rows = torch.from_numpy(np.concatenate([s + f for s, f in zip(starts, frames)]))
+    for name, (past, predict) in tuned(series, horizon).items():
+        found = moments(asked, past, horizon).rows(rows)
+        by[name] = predict(moments(series, past, horizon), found).numpy()
+    episode = np.array([e.index for e in unseen])[found.episode.numpy()]
+    return Predicted(by, found.target.numpy(), found.state.numpy(), episode, report.choices)
 
 
 def relative_errors(
-    predicted: Tensor, real: Tensor, span: Tensor
+    predicted: Array, real: Array, span: Array
 ) -> tuple[float | None, list[float | None]]:
     """Errors relative to standing still.
 
@@ -219,8 +212,8 @@ def relative_errors(
     error, still = ((x**2).mean(0) for x in (predicted - real, real))
     moves = span > 0
     shares = [(x[moves] / span[moves] ** 2).sum() for x in (error, still)]
-    over_all = float((shares[0] / shares[1]).sqrt()) if float(shares[1]) > 0 else None
-    each = [float((e / s).sqrt()) if float(s) > 0 else None for e, s in zip(error, still)]
+    over_all = float(np.sqrt(shares[0] / shares[1])) if shares[1] > 0 else None
+    each = [float(np.sqrt(e / s)) if s > 0 else None for e, s in zip(error, still)]
     return over_all, each
 
 
@@ -232,40 +225,38 @@ def _report(
     parts: list[list[int]],
     config: OpenLoopConfig,
 ) -> dict[str, Any]:
-    states = torch.from_numpy(np.concatenate([episode.state for episode in data])).double()
-    span = states.amax(0) - states.amin(0)
+    states = np.concatenate([episode.state for episode in data]).astype(np.float64)
+    span = states.max(0) - states.min(0)
     figures = {}
     for name, folds in found.items():
-        real = torch.cat([fold.real for fold in folds])
-        hasm, knn = (torch.cat([getattr(fold, who) for fold in folds]) for who in ("hasm", "knn"))
-        (mine, my_joints), (theirs, their_joints) = (
-            relative_errors(predicted, real, span) for predicted in (hasm, knn)
-        )
+        real = np.concatenate([fold.real for fold in folds])
+        errors = {
+            who: relative_errors(np.concatenate([fold.by[who] for fold in folds]), real, span)
+            for who in folds[0].by
+        }
         figures[name] = {
             "frames_ahead": horizons[name],
             "seconds_ahead": horizons[name] / data.fps,
             "frames": len(real),
-            "hasm": mine,
-            "knn": theirs,
+            **{who: over_all for who, (over_all, _) in errors.items()},
             "still": 1.0,
             "per_joint": {
-                joint: {"hasm": a, "knn": b}
-                for joint, a, b in zip(body.joints, my_joints, their_joints)
+                joint: {who: each[j] for who, (_, each) in errors.items()}
+                for j, joint in enumerate(body.joints)
             },
-            "settings": [fold.settings for fold in folds],
+            "choices": [fold.choices for fold in folds],
         }
     ahead = figures["horizon"]
     return {
         "horizon_s": ahead["seconds_ahead"],
-        **{key: ahead[key] for key in ("hasm", "knn", "still", "per_joint")},
+        **{key: ahead[key] for key in (*CONTESTANTS, "still", "per_joint")},
         "error": "RMS over held-out frames, joints in shares of their range, over that of still",
-        "knn_is": f"mean of {NEIGHBOURS} neighbours, inputs and outputs chosen like those of hasm",
         "one_step": figures["one_step"],
         "horizon": ahead,
         "method": config.method,
         "seed": config.seed,
         "folds": [[data.episodes[i].index for i in part] for part in parts],
-        "dataset": str(config.dataset.root),
+        "dataset": config.dataset.root.name if config.dataset.root else "",
         "touch": bool(body.channels),
     }
 
@@ -279,15 +270,18 @@ def table(report: dict[str, Any]) -> str:
         )
 
     one, ahead = report["one_step"], report["horizon"]
+    names = "".join(f"{who:>15}" for who in CONTESTANTS)
+    later = f"{report['horizon_s']:.3g} s ahead"
+    wide = 15 * len(CONTESTANTS)
     lines = [
         "error relative to standing still (1 = predicting the present state)",
-        f"{'':<28}{'one step':>15}{'':>15}{f'{report["horizon_s"]:.3g} s ahead':>15}",
-        f"{'':<28}{'hasm':>15}{'5-NN':>15}{'hasm':>15}{'5-NN':>15}",
-        row("all joints", one["hasm"], one["knn"], ahead["hasm"], ahead["knn"]),
+        f"{'':<28}{'one frame ahead':>{wide}}{later:>{wide}}",
+        f"{'':<28}{names}{names}",
+        row("all joints", *(part[who] for part in (one, ahead) for who in CONTESTANTS)),
     ]
-    for joint, errors in one["per_joint"].items():
-        later = ahead["per_joint"][joint]
-        lines.append(row(joint, errors["hasm"], errors["knn"], later["hasm"], later["knn"]))
+    for joint in one["per_joint"]:
+        errors = [part["per_joint"][joint][who] for part in (one, ahead) for who in CONTESTANTS]
+        lines.append(row(joint, *errors))
     return "\n".join(lines)
 
 
@@ -297,19 +291,20 @@ def _plot(path: Path, data: EpisodeSet, folds: list[Predicted], report: dict[str
 
     fold = folds[0]
     count = min(len(fold.real), max(2, round(PLOT_SECONDS * data.fps)))
-    share = fold.real.square().mean(0) / (fold.state.amax(0) - fold.state.amin(0)) ** 2
-    joints = share.nan_to_num(0.0).argsort(descending=True)[:PLOT_JOINTS].sort().values
+    span = np.ptp(fold.state, axis=0)
+    share = np.divide((fold.real**2).mean(0), span**2, out=np.zeros_like(span), where=span > 0)
+    joints = np.sort(np.argsort(-share)[:PLOT_JOINTS])
     seconds = np.arange(count) / data.fps
-    seconds[np.flatnonzero(np.diff(fold.episode[:count].numpy()))] = np.nan
+    seconds[np.flatnonzero(np.diff(fold.episode[:count]))] = np.nan
 
-    def positions(displacement: Tensor) -> Array:
-        return (fold.state + displacement)[:count, joints].numpy()
+    def positions(displacement: Array) -> Array:
+        return (fold.state + displacement)[:count, joints]
 
     plot_prediction(
         path,
         seconds,
         positions(fold.real),
-        {"memory": positions(fold.hasm), "5 nearest neighbours": positions(fold.knn)},
+        {"memory": positions(fold.by["hasm"]), "neighbours": positions(fold.by["neighbours"])},
         [(data.joints[j], data.units[j]) for j in joints.tolist()],
         f"Joint positions {report['horizon_s']:.3g} s ahead, predicted in held-out episodes",
     )

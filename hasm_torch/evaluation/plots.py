@@ -1,5 +1,6 @@
 """Figures of an evaluation, drawn with matplotlib."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def plot_trajectory(
     position: Array,
     force: Array,
     speed: Array,
-    patches: list[str | None],
+    patches: Sequence[str],
     joint: str,
 ) -> None:
     """Joint trajectory, force and joint speed over time, the touched patches shaded.
@@ -38,7 +39,7 @@ def plot_trajectory(
         position: (T,) rad.
         force: (T,) N.
         speed: (T,) rad/s.
-        patches: (T,) patch touched, or None.
+        patches: (T,) patch touched, "" for none.
         joint: Name of the joint.
     """
     figure, axes = plt.subplots(3, 1, sharex=True, figsize=(9, 6.5))
@@ -56,7 +57,7 @@ def plot_trajectory(
     named = dict(zip(labels, handles))
     axes[0].legend(named.values(), named.keys(), loc="best", title="touched patch")
     axes[0].set_title("Pseudo-compliance: the joint yields to the touch, faster the harder it is")
-    _save(figure, path)
+    save(figure, path)
 
 
 def plot_force_speed(path: Path, behaviours: dict[str, dict[str, Any]]) -> None:
@@ -81,7 +82,7 @@ def plot_force_speed(path: Path, behaviours: dict[str, dict[str, Any]]) -> None:
         axis.set_xlabel("force (N)")
         axis.grid(alpha=0.3)
     np.atleast_1d(axes)[0].set_ylabel("mean joint speed (rad/s)")
-    _save(figure, path)
+    save(figure, path)
 
 
 def plot_recall(
@@ -89,23 +90,25 @@ def plot_recall(
     time: Array,
     weights: list[tuple[str, Array] | None],
     names: list[str],
+    rows: str = "stored association",
 ) -> None:
-    """Recall weights over the stored sequences through a rollout, a panel a memory.
+    """Recall weights through a rollout, a panel a patch.
 
     Args:
         path: PNG to write.
         time: (T,) s.
-        weights: (T,) patch and softmax weight of each of its associations, or None without touch.
+        weights: (T,) patch and (K,) softmax weights, or None without touch.
         names: Patches to draw.
+        rows: What the K weights belong to.
     """
     figure, axes = plt.subplots(len(names), 1, sharex=True, figsize=(9, 2.8 * len(names)))
     for axis, name in zip(np.atleast_1d(axes), names):
-        found = [(t, w[1]) for t, w in zip(time, weights) if w is not None and w[0] == name]
+        found = [(i, w[1]) for i, w in enumerate(weights) if w is not None and w[0] == name]
         if found:
             count = len(found[0][1])
             image = np.full((count, len(time)), np.nan)
-            for t, column in found:
-                image[:, int(np.searchsorted(time, t))] = column
+            for i, column in found:
+                image[:, i] = column
             shown = axis.imshow(
                 image,
                 aspect="auto",
@@ -114,13 +117,12 @@ def plot_recall(
                 extent=(time[0], time[-1], 0, count),
                 cmap="viridis",
                 vmin=0,
-                vmax=1,
             )
             figure.colorbar(shown, ax=axis, label="softmax weight")
-        axis.set_ylabel(f"{name}\nstored association")
+        axis.set_ylabel(f"{name}\n{rows}")
     np.atleast_1d(axes)[-1].set_xlabel("time (s); blank where the patch is not touched")
     np.atleast_1d(axes)[0].set_title("Recall weights through a grasp")
-    _save(figure, path)
+    save(figure, path)
 
 
 def plot_prediction(
@@ -151,15 +153,15 @@ def plot_prediction(
     np.atleast_1d(axes)[0].set_title(title)
     np.atleast_1d(axes)[0].legend(loc="best", fontsize=8)
     np.atleast_1d(axes)[-1].set_xlabel("time (s), held-out episodes one after the other")
-    _save(figure, path)
+    save(figure, path)
 
 
-def _shade(axis: Any, time: Array, patches: list[str | None]) -> None:
+def _shade(axis: Any, time: Array, patches: Sequence[str]) -> None:
     start = 0
     for i in range(1, len(patches) + 1):
         if i == len(patches) or patches[i] != patches[start]:
             patch = patches[start]
-            if patch is not None:
+            if patch:
                 axis.axvspan(
                     time[start],
                     time[min(i, len(time) - 1)],
@@ -171,7 +173,8 @@ def _shade(axis: Any, time: Array, patches: list[str | None]) -> None:
             start = i
 
 
-def _save(figure: Any, path: Path) -> None:
+def save(figure: Any, path: Path) -> None:
+    """Write a figure and let go of it."""
     figure.tight_layout()
     figure.savefig(path, dpi=120)
     plt.close(figure)

@@ -1,8 +1,8 @@
 """One rollout: a human touches, a policy answers, the simulation moves."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -11,6 +11,8 @@ from torch import Tensor
 
 Array = NDArray[np.float64]
 
+FINGERS = 2  # that a human touches with at once
+
 
 class Policy(Protocol):
     """What is rolled out: joint positions and skin in, joint targets out."""
@@ -18,26 +20,19 @@ class Policy(Protocol):
     def reset(self) -> None:
         """Start a new rollout."""
 
-    def step(self, state: Tensor, skin: Tensor) -> Tensor:
-        """Target of one control step; see ``HASM.step``."""
+    def step(self, state: Tensor, skin: Tensor, *, observation: Tensor | None = None) -> Tensor:
+        """Target of one control step, see ``HASM.step``; the observation is what else is seen."""
 
 
 class Human(Protocol):
-    """Whoever touches the robot with one finger."""
+    """Whoever touches the robot with one or two fingers, and may hold some of its joints."""
 
-    def touch(self, time: float, state: Array) -> tuple[str | None, float]:
-        """Patch to press and force, N, from now on; None leaves the skin alone."""
+    def touches(self, time: float, state: Array) -> Mapping[str, tuple[float, int | None]]:
+        """Force, N, and cell (None: the centre) of each patch that is pressed from now on."""
 
-    def finished(self, time: float, state: Array) -> bool:
-        """Whether the rollout is over."""
-
-
-@runtime_checkable
-class Holder(Protocol):
-    """Whoever touches several patches of the robot at once."""
-
-    def touches(self, time: float, state: Array) -> dict[str, float]:
-        """Force on each patch that is pressed from now on, N; the other skin is left alone."""
+    def holds(self, time: float) -> Sequence[str]:
+        """Joints that do not move from now on, whatever the robot wants."""
+        return ()
 
     def finished(self, time: float, state: Array) -> bool:
         """Whether the rollout is over."""
@@ -45,42 +40,55 @@ class Holder(Protocol):
 
 @dataclass
 class Trace:
-    """What happened, one row a control step.
+    """What happened, one row a control step; positions and forces in the frame ``odom``.
 
     Attributes:
         time: (T,) s.
         state: (T, joints) measured joint positions, rad or m.
         target: (T, joints) joint targets, rad or m.
         velocity: (T, joints) measured joint speeds, rad/s or m/s.
-        force: (T,) force that the fingers really applied, N.
-        patch: (T,) name of the (first) patch pressed, or None.
-        object_height: (T,) height of the object above its place on the table, m.
+        patch: (T, fingers) patch that each finger presses, "" for none.
+        cell: (T, fingers) cell of the patch, -1 for none or the patch's centre.
+        force: (T, fingers, 3) force that each finger really applied to the skin, N; 0 for none.
+        point: (T, fingers, 3) where the pressed point of the skin is, m; NaN for none.
+        object: (T, 3) centre of the object, m; NaN without one.
+        height: (T,) height of the object above its place on the table, m.
         success: What the environment said at the end.
-        frames: Pictures, if asked for.
-        skin: (T, cells, 3) forces on the skin, N.
     """
 
     time: Array
     state: Array
     target: Array
     velocity: Array
+    patch: NDArray[np.str_]
+    cell: NDArray[np.int64]
     force: Array
-    patch: list[str | None]
-    object_height: Array
+    point: Array
+    object: Array
+    height: Array
     success: bool
-    frames: list[NDArray[np.uint8]] = field(default_factory=list)
-    skin: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple[Any, ...]], success: bool) -> "Trace":
+        """A trace from the rows of its control steps, see ``row_of``."""
+        names = [f.name for f in fields(cls) if f.name != "success"]
+        columns = {n: np.array(c) for n, c in zip(names, zip(*rows, strict=True), strict=True)}
+        return cls(**columns, success=success)
+
+    @property
+    def strength(self) -> Array:
+        """(T,) force of all fingers together, N, whatever their directions."""
+        return np.asarray(np.linalg.norm(self.force, axis=2).sum(axis=1))
 
 
 def roll_out(
     env: Any,
     policy: Policy,
-    human: Human | Holder,
+    human: Human,
     joints: Array,
     seed: int,
     object_offset: tuple[float, float] = (0.0, 0.0),
-    frame_every: int = 0,
-    watch: Callable[[Policy], None] | None = None,
+    watch: Callable[[], None] | None = None,
 ) -> Trace:
     """Roll a policy out.
 
@@ -91,8 +99,7 @@ def roll_out(
         joints: (joints,) start positions, rad or m.
         seed: Seed of the environment.
         object_offset: How far the object stands from its usual place, m.
-        frame_every: Take a picture every so many steps; 0 takes none.
-        watch: Called with the policy after every step.
+        watch: Called after every step.
 
     Returns:
         What happened.
@@ -100,40 +107,48 @@ def roll_out(
     sim = env.unwrapped
     observation, info = env.reset(seed=seed, options={"joints": joints, "object": object_offset})
     policy.reset()
-    names = ("time", "state", "target", "velocity", "force", "skin", "patch", "height")
-    rows: dict[str, list[Any]] = {name: [] for name in names}
-    frames: list[NDArray[np.uint8]] = []
+    rows: list[tuple[Any, ...]] = []
     success = False
     time, state = float(info["time"]), np.asarray(observation["state"], dtype=np.float64)
     while not human.finished(time, state):
-        if isinstance(human, Holder):
-            sim.touch_all(human.touches(time, state))
-        else:
-            sim.touch(*human.touch(time, state))
-        target = policy.step(
-            torch.from_numpy(observation["state"]), torch.from_numpy(observation["tactile"])
-        ).numpy()
-        if watch is not None:
-            watch(policy)
+        sim.touch_all(human.touches(time, state))
+        sim.block(human.holds(time))
+        target = _ask(policy, observation)
         observation, _, _, truncated, info = env.step(target)
         time, state = float(info["time"]), np.asarray(observation["state"], dtype=np.float64)
         success = bool(info["is_success"])
-        motion = (time, state, target, sim.joint_velocity)
-        touch = (info["finger_force"], sim.skin_forces, info["touched"])
-        for name, value in zip(names, (*motion, *touch, info["object_height"])):
-            rows[name].append(value)
-        if frame_every and len(rows["time"]) % frame_every == 0:
-            frames.append(env.render())
+        rows.append(row_of(sim, target, info))
+        if watch is not None:
+            watch()
         if truncated:
             break
-    series = {
-        name: np.array(rows[name], dtype=np.float64)
-        for name in ("time", "state", "target", "velocity", "force", "skin")
-    }
-    heights = np.array(rows["height"], dtype=np.float64)
-    return Trace(
-        **series, patch=rows["patch"], object_height=heights, success=success, frames=frames
+    return Trace.of(rows, success)
+
+
+def row_of(sim: Any, target: Array, info: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What a ``HSRTouchEnv`` shows after a control step, a row of a ``Trace``."""
+    place = sim.object_position
+    return (
+        *(float(info["time"]), sim.joint_position, target, sim.joint_velocity),
+        *_fingers(sim.touch_points()),
+        np.full(3, np.nan) if place is None else place,
+        info["object_height"],
     )
+
+
+def _ask(policy: Policy, observation: Mapping[str, Any]) -> Array:
+    state, skin = (torch.from_numpy(observation[name]) for name in ("state", "tactile"))
+    seen = observation.get("environment_state")
+    if seen is None:
+        return policy.step(state, skin).numpy()
+    return policy.step(state, skin, observation=torch.from_numpy(seen)).numpy()
+
+
+def _fingers(touches: Sequence[Any]) -> tuple[Any, ...]:
+    """Patch, cell, force and point of every finger, those that touch first."""
+    idle = [("", None, np.zeros(3), np.full(3, np.nan))] * (FINGERS - len(touches))
+    patch, cell, force, point = zip(*touches, *idle)
+    return patch, [-1 if c is None else c for c in cell], force, point
 
 
 def limit_violations(

@@ -3,87 +3,104 @@
 import multiprocessing
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
-from hasm_torch.evaluation import compliance, grasp
-from hasm_torch.evaluation.rollout import Array, Trace
+from hasm_torch.evaluation import compliance, grasp, yielding
+from hasm_torch.evaluation.rollout import Array, Policy, Trace
 from hasm_torch.model.hasm import HASM
+from hasm_torch.sim.teacher import ComplianceTeacher, GraspTeacher, YieldTeacher
 
-EXPERIMENTS = ("compliance", "grasp")
+Rolled = tuple[Trace, dict[str, Any]]
+Case = compliance.ComplianceCase | yielding.YieldCase | grasp.GraspCase
+
+_MODULES: dict[str, Any] = {"compliance": compliance, "yield": yielding, "grasp": grasp}
+_TEACHERS: dict[str, Any] = {
+    "compliance": ComplianceTeacher,
+    "yield": YieldTeacher,
+    "grasp": GraspTeacher,
+}
+EXPERIMENTS = tuple(_MODULES)
 MAX_STEPS = 10_000  # more than any human's patience
 
-_worker: dict[str, Any] = {}
+# What a worker process has made so far: environments by scene, policies by name; and how.
+_envs: dict[str, Any] = {}
+_policies: dict[str, Policy] = {}
+_loaders: list[Callable[[str], Policy]] = []
 
 
-def run_cases(
-    experiment: str, cases: Sequence[Any], checkpoint: Path, workers: int | None = None
-) -> list[dict[str, Any]]:
-    """Roll out the cases of one experiment, with a progress bar.
+class Runner:
+    """Processes that roll cases out as soon as they are handed in, with a progress bar.
+
+    Close it at the end.
 
     Args:
-        experiment: "compliance" or "grasp".
-        cases: ``compliance.ComplianceCase`` or ``grasp.GraspCase``.
-        checkpoint: Directory of the model.
-        workers: Processes; by default one a core.
-
-    Returns:
-        The figures of each case, in order.
+        load: Makes a policy from the directory of its checkpoint.
     """
-    check_experiments([experiment])
-    workers = min(workers or os.cpu_count() or 1, len(cases))
-    figures: list[dict[str, Any]] = [{} for _ in cases]
-    with (
-        ProcessPoolExecutor(
-            workers,
+
+    def __init__(self, load: Callable[[str], Policy] = HASM.from_pretrained) -> None:
+        self._pool = ProcessPoolExecutor(
+            os.cpu_count() or 1,
             mp_context=multiprocessing.get_context("spawn"),
-            initializer=_start_worker,
-            initargs=(experiment, str(checkpoint)),
-        ) as pool,
-        tqdm(total=len(cases), desc=f"{experiment} rollouts", unit="rollout") as bar,
-    ):
-        running = {pool.submit(_run_in_worker, case): i for i, case in enumerate(cases)}
-        for future in as_completed(running):
-            figures[running[future]] = future.result()
-            bar.update()
-    return figures
+            initializer=_begin,
+            initargs=(load,),
+        )
+        self._bar = tqdm(total=0, desc="rollouts", unit="rollout")
+
+    def start(
+        self, experiment: str, cases: Sequence[Case], checkpoint: Path | None
+    ) -> list[Future[Rolled]]:
+        """Hand cases of one experiment in.
+
+        Args:
+            experiment: One of ``EXPERIMENTS``.
+            cases: The cases.
+            checkpoint: Directory of the policy; None is the demonstrator's own law.
+
+        Returns:
+            The trace and the figures of each case, in order, once they are there.
+        """
+        name = None if checkpoint is None else str(checkpoint)
+        futures = [self._pool.submit(_roll_out, experiment, case, name) for case in cases]
+        self._bar.total += len(futures)
+        for future in futures:
+            future.add_done_callback(lambda _: self._bar.update())
+        return futures
+
+    def close(self) -> None:
+        """End the processes; what they have not begun is left."""
+        self._pool.shutdown(cancel_futures=True)
+        self._bar.close()
 
 
 def run_case(
     experiment: str,
-    case: Any,
+    case: Case,
     env: Any,
-    policy: Any,
-    frame_every: int = 0,
-    watch: Callable[[Any], None] | None = None,
+    policy: Policy,
+    watch: Callable[[], None] | None = None,
     start: Array | None = None,
-) -> tuple[Trace, dict[str, Any]]:
+) -> Rolled:
     """Roll one case out in this process.
 
     Args:
-        experiment: "compliance" or "grasp".
+        experiment: One of ``EXPERIMENTS``.
         case: The case.
         env: The environment of the experiment.
         policy: The policy.
-        frame_every: Take a picture every so many steps; 0 takes none.
-        watch: Called with the policy after every step.
-        start: (joints,) start posture in place of the case's own (compliance) or of the usual
-            one, to which the case adds noise (grasp), rad or m.
+        watch: Called after every step.
+        start: (joints,) start posture in place of the case's own (compliance, yield) or of the
+            usual one, to which the case adds noise (grasp), rad or m.
 
     Returns:
         The trace and its figures.
     """
-    if experiment == "compliance":
-        return compliance.run_case(case, env, policy, frame_every, watch, start)
-    from hasm_torch.sim.poses import START_POSES
-
-    home = np.array(START_POSES["grasp"]) if start is None else start
-    return grasp.run_case(case, env, policy, home, frame_every, watch)
+    rolled: Rolled = _MODULES[experiment].run_case(case, env, policy, watch, start)
+    return rolled
 
 
 def make_env(experiment: str, render: bool = False) -> Any:
@@ -94,27 +111,39 @@ def make_env(experiment: str, render: bool = False) -> Any:
 
     return gymnasium.make(
         "hasm_torch/HSRTouch-v0",
-        scene=experiment,
+        scene="grasp" if experiment == "grasp" else "compliance",
         render_mode="rgb_array" if render else None,
         max_episode_steps=MAX_STEPS,
         disable_env_checker=True,
     )
 
 
+def make_teacher(experiment: str, env: Any) -> Policy:
+    """The demonstrator's own law of an experiment, as a policy."""
+    teacher: Policy = _TEACHERS[experiment](env.unwrapped)
+    return teacher
+
+
 def check_experiments(experiments: Sequence[str]) -> None:
-    """Raise ValueError for an experiment that does not exist."""
+    """Raise ValueError for an experiment that does not exist, or none at all."""
+    valid = f"valid: {', '.join(EXPERIMENTS)}"
+    if not experiments:
+        raise ValueError(f"experiments is empty, {valid}")
     for experiment in experiments:
         if experiment not in EXPERIMENTS:
-            raise ValueError(f"unknown experiment {experiment!r}, valid: {', '.join(EXPERIMENTS)}")
+            raise ValueError(f"unknown experiment {experiment!r}, {valid}")
 
 
-def _start_worker(experiment: str, checkpoint: str) -> None:
+def _begin(load: Callable[[str], Policy]) -> None:
     torch.set_num_threads(1)
-    _worker["experiment"] = experiment
-    _worker["env"] = make_env(experiment)
-    _worker["policy"] = HASM.from_pretrained(checkpoint)
+    _loaders.append(load)
 
 
-def _run_in_worker(case: Any) -> dict[str, Any]:
-    _, figures = run_case(_worker["experiment"], case, _worker["env"], _worker["policy"])
-    return figures
+def _roll_out(experiment: str, case: Case, checkpoint: str | None) -> Rolled:
+    if experiment not in _envs:
+        _envs[experiment] = make_env(experiment)
+    env, name = _envs[experiment], checkpoint or f"{experiment} teacher"
+    if name not in _policies:
+        made = make_teacher(experiment, env) if checkpoint is None else _loaders[0](checkpoint)
+        _policies[name] = made
+    return run_case(experiment, case, env, _policies[name])

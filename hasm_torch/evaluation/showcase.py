@@ -1,22 +1,23 @@
-"""Rollouts that are shown: figures and videos of both experiments."""
+"""Rollouts that are shown in figures and recordings."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hasm_torch.apps.rerun_recording import Scenes, cell_places, write_recording
-from hasm_torch.evaluation import plots
-from hasm_torch.evaluation.compliance import BEHAVIOURS, ComplianceCase
+from hasm_torch.data.episodes import load_episodes
+from hasm_torch.evaluation import plots, teaching, touch_plots, yielding
 from hasm_torch.evaluation.grasp import GraspCase
-from hasm_torch.evaluation.rollout import Array, roll_out
+from hasm_torch.evaluation.options import EvalConfig
+from hasm_torch.evaluation.rollout import Array, Human, roll_out
 from hasm_torch.evaluation.runner import make_env, run_case
-from hasm_torch.evaluation.video import caption, write_video
+from hasm_torch.evaluation.suite import MOVED
+from hasm_torch.evaluation.viewer import Scenes, cell_places, write_recording
 from hasm_torch.model.hasm import HASM
 from hasm_torch.robot import JOINTS
-from hasm_torch.sim.poses import START_POSES
+from hasm_torch.sim.tasks import FAR, GRASP_PATCH, OBJECT_PLACES, REACH_PATCH, START_POSES
 
-FRAME_EVERY = 2  # control steps, so that videos run at half the control rate
 SHOWN_JOINT = "arm_flex_joint"
 # (begin s, end s, patch, lowest N, highest N): two pushes each way, the second pair harder.
 SCRIPT = (
@@ -25,82 +26,116 @@ SCRIPT = (
     (4.2, 5.7, "wrist_under", 2.0, 6.0),
     (6.2, 7.4, "wrist_under", 4.0, 12.0),
 )
+YIELD_VIEWS = 3
+LEAST_SHOWN = 6.0  # N, so that a way can be seen
+POSTURE_JOINTS = ("arm_flex_joint", "arm_roll_joint")
 
 
-class _Script:
+class Script(Human):
     """A human who follows ``SCRIPT``, each push swelling and fading."""
 
-    def touch(self, time: float, state: Array) -> tuple[str | None, float]:
+    def touches(self, time: float, state: Array) -> dict[str, tuple[float, int | None]]:
+        """The push that is on."""
         for begin, end, patch, low, high in SCRIPT:
             if begin <= time < end:
                 swell = np.sin(np.pi * (time - begin) / (end - begin)) ** 2
-                return patch, low + (high - low) * float(swell)
-        return None, 0.0
+                return {patch: (low + (high - low) * float(swell), None)}
+        return {}
 
     def finished(self, time: float, state: Array) -> bool:
+        """Some time after the last push."""
         return time >= SCRIPT[-1][1] + 0.6
 
 
-def draw_compliance(model: HASM, metrics: dict[str, Any], directory: Path) -> list[Path]:
-    """The figure of the paper, and force against speed.
-
-    Args:
-        model: Model trained on the compliance episodes.
-        metrics: Figures of the rollouts.
-        directory: Where the figures go.
-
-    Returns:
-        The figures written.
-    """
+def draw_compliance(
+    config: EvalConfig, model: HASM, metrics: Mapping[str, Any], directory: Path
+) -> list[Path]:
+    """The figure of the paper, and force against speed; see ``draw_yield``."""
     env = make_env("compliance")
-    start = np.array(START_POSES["compliance"])
-    trace = roll_out(env, model, _Script(), start, seed=0)
+    trace = roll_out(env, model, Script(), np.array(START_POSES["compliance"]), seed=0)
+    env.close()
     joint = JOINTS.index(SHOWN_JOINT)
     trajectory, force_speed = directory / "compliance.png", directory / "force_speed.png"
     plots.plot_trajectory(
         trajectory,
         trace.time,
         trace.state[:, joint],
-        trace.force,
+        trace.strength,
         trace.velocity[:, joint],
-        trace.patch,
+        trace.patch[:, 0].tolist(),
         SHOWN_JOINT,
     )
     plots.plot_force_speed(force_speed, metrics["behaviours"])
-    env.close()
     return [trajectory, force_speed]
 
 
-def draw_grasp(model: HASM, seed: int, directory: Path) -> list[Path]:
-    """The recall weights over the stored sequences through one grasp.
+def draw_yield(
+    config: EvalConfig, model: HASM, metrics: Mapping[str, Any], directory: Path
+) -> list[Path]:
+    """Pushes from two sides, one soft recall, and shares against demonstrations.
 
     Args:
-        model: Model trained on the grasp episodes.
-        seed: Seed of the rollout.
-        directory: Where the figure goes.
+        config: What is evaluated.
+        model: Model of the experiment.
+        metrics: Figures of its rollouts.
+        directory: Where the figures go.
 
     Returns:
-        The figure written.
+        The figures written.
     """
-    env = make_env("grasp")
-    recalled: list[tuple[str, Array] | None] = []
-
-    def watch(_: Any) -> None:
-        recalled.append(_weights(model))
-
-    case = GraspCase(seed, 2, 0.05, 0.01, 7.0)
-    trace, _ = run_case("grasp", case, env, model, watch=watch)
-    path = directory / "recall_weights.png"
-    plots.plot_recall(path, trace.time, recalled, sorted(model.patches))
+    cases = yielding.cases(100, config.seed, kinds=("even",))
+    strong = {next(iter(c.push.pressed)): c for c in cases if _strength(c) > LEAST_SHOWN}
+    env = _env_with_pictures()
+    shown = list(strong.items())[:YIELD_VIEWS]
+    seen = [_watched(env, model, patch, case) for patch, case in shown]
     env.close()
-    return [path]
+    paths = [directory / "yield.png"]
+    touch_plots.plot_yield(paths[0], [view for view, _ in seen])
+    if "episodes" in metrics:
+        paths.append(directory / "yield_episodes.png")
+        touch_plots.plot_shares(paths[-1], {"memory": metrics["episodes"]})
+    if config.checkpoint is None:
+        episodes = load_episodes(config.datasets / "hsr_yield").episodes
+        episodes = teaching.wrist_and_torso(config.episodes)(episodes)
+        recalls = seen[0][1]
+        weights, reference = recalls[len(recalls) // 2]
+        joints = [JOINTS.index(joint) for joint in POSTURE_JOINTS]
+        postures = np.array([episodes[e].state[t, joints] for e, t, _ in model.origins])
+        paths.append(directory / "yield_recall.png")
+        touch_plots.plot_weights(
+            paths[-1], weights, model.origins, postures, reference[joints], POSTURE_JOINTS
+        )
+    return paths
+
+
+def draw_grasp(
+    config: EvalConfig, model: HASM, metrics: Mapping[str, Any], directory: Path
+) -> list[Path]:
+    """Recall weights over the stored motions through one grasp, and moved objects; see above."""
+    env = make_env("grasp")
+    recalled = _Recalled(model)
+    case = GraspCase(config.seed, 7.0, (FAR / 2, -FAR / 2), pauses=2)
+    trace, _ = run_case("grasp", case, env, model, recalled)
+    env.close()
+    paths = [directory / "recall_weights.png"]
+    plots.plot_recall(paths[0], trace.time, recalled.weights, [REACH_PATCH, GRASP_PATCH])
+    if "moved_results" in metrics:
+        places = {
+            f"{reach:.2f}": OBJECT_PLACES[: teaching.NEAR_PLACES]
+            if choice is teaching.near_places
+            else OBJECT_PLACES[teaching.NEAR_PLACES :]
+            for reach, choice in MOVED.items()
+        }
+        paths.append(directory / "moved_object.png")
+        touch_plots.plot_moved(paths[-1], metrics["moved_results"], places)
+    return paths
 
 
 def record(experiment: str, model: HASM, seed: int, directory: Path) -> Path:
     """A recording of one rollout for the Rerun viewer.
 
     Args:
-        experiment: "compliance" or "grasp".
+        experiment: The experiment.
         model: The model.
         seed: Seed of the rollout.
         directory: Where the recording goes.
@@ -110,22 +145,26 @@ def record(experiment: str, model: HASM, seed: int, directory: Path) -> Path:
     """
     env = make_env(experiment)
     spikes: list[Array] = []
-    recalled: list[tuple[str, Array] | None] = []
+    skin: list[Array] = []
+    recalled = _Recalled(model)
 
-    def watch(_: Any) -> None:
-        recalled.append(_weights(model))
+    def watch() -> None:
+        recalled()
         spikes.append(model.rollout.spikes[-1])
+        skin.append(env.unwrapped.skin_forces)
 
     if experiment == "compliance":
         start = np.array(START_POSES[experiment])
-        trace = roll_out(env, model, _Script(), start, seed, watch=watch)
+        trace = roll_out(env, model, Script(), start, seed, watch=watch)
+    elif experiment == "yield":
+        [case] = yielding.cases(1, seed)
+        trace, _ = run_case(experiment, case, env, model, watch)
     else:
-        case = GraspCase(seed, 2, 0.05, 0.01, 7.0)
-        trace, _ = run_case(experiment, case, env, model, watch=watch)
+        trace, _ = run_case(experiment, GraspCase(seed, 7.0, pauses=2), env, model, watch)
     env.close()
     joints, patches = list(JOINTS), list(model.body.patches)
     scenes = Scenes(
-        trace.time, joints, trace.state, trace.skin, patches, np.array(spikes), recalled
+        trace.time, joints, trace.state, np.array(skin), patches, np.array(spikes), recalled.weights
     )
     scenes.cells = cell_places(joints, trace.state)
     path = directory / f"{experiment}.rrd"
@@ -133,55 +172,55 @@ def record(experiment: str, model: HASM, seed: int, directory: Path) -> Path:
     return path
 
 
-def _weights(model: HASM) -> tuple[str, Array] | None:
-    touched = model.touched
-    if not touched:
-        return None
-    memory = model.memory(touched[0])
-    positions = model.reference[memory.joints]
-    density = model.density[model.body.patches.index(touched[0])]
-    link = model.link_rotation(touched[0], model.reference)
-    return touched[0], memory.weights(positions, density, link, touched[0]).double().numpy()
+class _Recalled:
+    """Notes after every step what was recalled last for the patch that is touched.
 
-
-def film(experiment: str, model: HASM, seed: int, directory: Path) -> Path:
-    """A video of an experiment; touched cells light up.
-
-    Args:
-        experiment: "compliance" or "grasp".
-        model: The model.
-        seed: Seed of the rollouts.
-        directory: Where the video goes.
-
-    Returns:
-        The video written.
-
-    Raises:
-        RuntimeError: If there is no OpenGL to draw with.
+    Attributes:
+        weights: Patch and weights of each step, None without touch.
     """
-    env = make_env(experiment, render=True)
-    frames = []
+
+    def __init__(self, model: HASM) -> None:
+        self._model = model
+        self._last: dict[str, Array] = {}
+        self.weights: list[tuple[str, Array] | None] = []
+
+    def __call__(self) -> None:
+        self._last |= dict(self._model.recalled())
+        known = [patch for patch in self._model.touched if patch in self._last]
+        self.weights.append((known[0], self._last[known[0]]) if known else None)
+
+
+def _watched(
+    env: Any, model: HASM, patch: str, case: yielding.YieldCase
+) -> tuple[touch_plots.View, list[tuple[Array, Array]]]:
+    """A push with pictures of its beginning and end; weights and reference of every recall."""
+    recalls: list[tuple[Array, Array]] = []
+    pictures: dict[str, list[Any]] = {camera: [] for camera in touch_plots.AXES}
+    sim, ends = env.unwrapped, (case.push.begin, case.push.end)
+
+    def watch() -> None:
+        for _, weights in model.recalled():
+            recalls.append((weights, model.reference.double().numpy()))
+        if sim.render_mode and np.abs(np.subtract(ends, sim.data.time)).min() < 0.01:
+            for camera, taken in pictures.items():
+                taken.append(sim.render(camera))
+
+    trace, _ = run_case("yield", case.without_rest(), env, model, watch)
+    both = {c: np.mean(taken, axis=0).astype(np.uint8) for c, taken in pictures.items() if taken}
+    return touch_plots.View(trace, patch, both), recalls
+
+
+def _strength(case: yielding.YieldCase) -> float:
+    return max(force for force, _ in case.push.pressed.values())
+
+
+def _env_with_pictures() -> Any:
+    """An environment that renders, or one that does not where nothing can."""
+    env = make_env("yield", render=True)
     try:
-        if experiment == "compliance":
-            for index in range(len(BEHAVIOURS)):
-                frames += _clip(env, model, ComplianceCase(index, seed, 8.0, True))
-        else:
-            frames += _clip(env, model, GraspCase(seed, 2, 0.05, 0.01, 8.0))
-    finally:
+        env.reset()
+        env.render()
+    except RuntimeError:
         env.close()
-    path = directory / f"{experiment}.mp4"
-    write_video(path, frames, env.metadata["render_fps"] // FRAME_EVERY)
-    return path
-
-
-def _clip(env: Any, model: HASM, case: Any) -> list[Any]:
-    experiment = "compliance" if isinstance(case, ComplianceCase) else "grasp"
-    start = np.array(START_POSES[experiment]) if experiment == "compliance" else None
-    trace, _ = run_case(experiment, case, env, model, frame_every=FRAME_EVERY, start=start)
-    clip = []
-    for i, frame in enumerate(trace.frames):
-        row = FRAME_EVERY * (i + 1) - 1
-        patch, force = trace.patch[row], trace.force[row]
-        text = f"{patch}  {force:.1f} N" if patch else "no touch"
-        clip.append(caption(frame, f"{trace.time[row]:5.2f} s   {text}"))
-    return clip
+        return make_env("yield")
+    return env

@@ -1,4 +1,4 @@
-"""LeRobot's environment type "hsr_touch": ``--env.type=hsr_touch --env.task=arm_down``."""
+"""LeRobot's environment type "hsr_touch": ``--env.type=hsr_touch --env.task=yield``."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -7,12 +7,16 @@ import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
-from hasm_torch.model.checkpoint import ACTION, POINTS, STATE, TACTILE
+from hasm_torch.encoders.readings import FORCES
+from hasm_torch.episode import ACTION, ENVIRONMENT, STATE, TACTILE
 from hasm_torch.robot import JOINTS, Skin
+from hasm_torch.sim.tasks import BEHAVIOURS
 
-GRASP = "grasp"
-TASKS = ("arm_down", "arm_up", "wrist_left", "wrist_right", GRASP)
+YIELD, TORSO, GRASP = "yield", "torso", "grasp"
+TASKS = (*(behaviour.name for behaviour in BEHAVIOURS), YIELD, TORSO, GRASP)
 GYM_ID = "hasm_torch/HumanTouch-v0"
+# Observations of the environment, and what LeRobot calls them.
+NAMES = {ACTION: ACTION, "state": STATE, "tactile": TACTILE, "environment_state": ENVIRONMENT}
 
 
 def check_task(task: str | None) -> None:
@@ -21,22 +25,13 @@ def check_task(task: str | None) -> None:
         raise ValueError(f"unknown task {task!r}, valid: {', '.join(TASKS)}")
 
 
-def _features() -> dict[str, PolicyFeature]:
-    joints, forces = (len(JOINTS),), (POINTS * Skin.load().cells,)
-    return {
-        ACTION: PolicyFeature(FeatureType.ACTION, joints),
-        "state": PolicyFeature(FeatureType.STATE, joints),
-        "tactile": PolicyFeature(FeatureType.STATE, forces),
-    }
-
-
 @EnvConfig.register_subclass("hsr_touch")
 @dataclass
 class HSRTouchConfig(EnvConfig):
     """The simulated HSR and a human who touches it; see ``human_env.HumanTouchEnv``.
 
     Attributes:
-        task: "arm_down", "arm_up", "wrist_left", "wrist_right" or "grasp".
+        task: "arm_down", "arm_up", "wrist_left", "wrist_right", "yield", "torso" or "grasp".
         force: Force of the touch, N, 0 to 15; None draws it for every episode.
         fps: Control rate, Hz.
     """
@@ -44,13 +39,19 @@ class HSRTouchConfig(EnvConfig):
     task: str | None = "arm_down"
     force: float | None = None
     fps: int = 50
-    features: dict[str, PolicyFeature] = field(default_factory=_features)
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {ACTION: ACTION, "state": STATE, "tactile": TACTILE}
-    )
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=lambda: dict(NAMES))
 
     def __post_init__(self) -> None:
         check_task(self.task)
+        joints = (len(JOINTS),)
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, joints),
+            "state": PolicyFeature(FeatureType.STATE, joints),
+            "tactile": PolicyFeature(FeatureType.STATE, (FORCES * Skin.load().cells,)),
+        }
+        if self.task == GRASP:
+            self.features["environment_state"] = PolicyFeature(FeatureType.ENV, (3,))
 
     @property
     def package_name(self) -> str:

@@ -1,10 +1,10 @@
 """A trained model as files, in the layout of a LeRobot policy.
 
-    config.json               "type": "hasm", the features, and under "model", "body" and "memories"
+    config.json               "type": "hasm", the features, and under "model", "body" and "settled"
                               what a HASM is built from
     model.safetensors         its state dict
     policy_preprocessor.json  LeRobot's steps around the policy, none of which changes a value:
-    policy_postprocessor.json radians, metres and newtons go in and come out
+    policy_postprocessor.json radians, metres and the skin's own unit go in and come out
 
 Source: LeRobot 0.6, `PreTrainedPolicy.from_pretrained` and `PolicyProcessorPipeline`.
 """
@@ -12,17 +12,16 @@ Source: LeRobot 0.6, `PreTrainedPolicy.from_pretrained` and `PolicyProcessorPipe
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from torch import Tensor, nn
 
 from hasm_torch.body import Body
-from hasm_torch.config import HASMConfig, MemoryShape, as_dict, write_json
-
-if TYPE_CHECKING:
-    from hasm_torch.model.hasm import HASM
+from hasm_torch.config import HASMConfig, as_dict, write_json
+from hasm_torch.episode import ACTION, STATE, TACTILE
+from hasm_torch.model.settled import Settled
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
-STATE, TACTILE, ACTION = "observation.state", "observation.tactile", "action"
-POINTS = 3  # force points a cell
 
 
 @dataclass
@@ -31,43 +30,39 @@ class Settings:
 
     config: HASMConfig
     body: Body
-    shapes: dict[str, MemoryShape]
+    settled: Settled
 
 
-def save(model: "HASM", directory: Path) -> None:
+def save(settings: Settings, tensors: dict[str, Tensor], directory: Path) -> None:
     """Write a model so that ``HASM.from_pretrained`` and LeRobot can load it.
 
     Args:
-        model: The model.
+        settings: What it is built from.
+        tensors: Its state dict.
         directory: Made if it is not there.
-
-    Raises:
-        RuntimeError: If the model has learned nothing.
     """
-    save_weights(model, directory)
-    observations, actions = features(model.body)
+    save_weights(tensors, directory)
+    observations, actions = features(settings.body)
     content = {
         "type": "hasm",
         "input_features": observations,
         "output_features": actions,
-        "model": as_dict(model.config),
-        "body": as_dict(model.body),
-        "memories": {patch: as_dict(shape) for patch, shape in model.shapes.items()},
+        "model": as_dict(settings.config),
+        "body": as_dict(settings.body),
+        "settled": as_dict(settings.settled),
     }
     write_json(directory / CONFIG_FILE, content)
     for name, steps in processors(observations, actions).items():
         write_json(directory / f"{name}.json", {"name": name, "steps": steps})
 
 
-def save_weights(model: "HASM", directory: Path) -> None:
-    """Write ``model.safetensors``, whole or not at all; arguments and errors as in ``save``."""
+def save_weights(tensors: dict[str, Tensor], directory: Path) -> None:
+    """Write ``model.safetensors``, whole or not at all; arguments as in ``save``."""
     from safetensors.torch import save_file
 
-    if not model.memories:
-        raise RuntimeError("nothing to save: the model has learned nothing yet")
     directory.mkdir(parents=True, exist_ok=True)
     partial = directory / (WEIGHTS_FILE + ".partial")
-    save_file({k: v.contiguous() for k, v in model.state_dict().items()}, partial)
+    save_file({name: values.contiguous() for name, values in tensors.items()}, partial)
     partial.replace(directory / WEIGHTS_FILE)
 
 
@@ -86,18 +81,19 @@ def read_settings(directory: Path) -> Settings:
             )
     try:
         content = json.loads((directory / CONFIG_FILE).read_text())
-        shapes = {p: MemoryShape(**shape) for p, shape in content["memories"].items()}
-        return Settings(HASMConfig(**content["model"]), Body(**content["body"]), shapes)
+        if "settled" not in content and "memories" in content:
+            raise ValueError("it is of an older version, with memories a patch")
+        parts = content["model"], content["body"], content["settled"]
+        return Settings(HASMConfig(**parts[0]), Body(**parts[1]), Settled(**parts[2]))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise damaged(directory, error) from error
 
 
-def load_weights(model: "HASM", directory: Path) -> None:
+def load_weights(model: nn.Module, directory: Path) -> None:
     """Load ``model.safetensors`` into a model built from the same checkpoint's settings.
 
     Raises:
-        ValueError: If the file is damaged, does not fit the settings, or leaves a memory empty or
-            partly filled.
+        ValueError: If the file is damaged, does not fit the settings, or the memory is not full.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -108,17 +104,13 @@ def load_weights(model: "HASM", directory: Path) -> None:
             if values.is_floating_point() and not bool(values.isfinite().all()):
                 raise ValueError(f"{name} holds NaN or infinity")
         model.load_state_dict(weights, strict=True)
-    except (RuntimeError, ValueError, SafetensorError) as error:
+        for name, values in weights.items():
+            if name.endswith("memory.count"):
+                held = weights[name.removesuffix("memory.count") + "origins"]
+                if int(values) != len(held):
+                    raise ValueError(f"{int(values)} associations held, expected {len(held)}")
+    except (RuntimeError, ValueError, KeyError, SafetensorError) as error:
         raise damaged(directory, error) from error
-    if not model.memories:
-        raise ValueError(f"checkpoint {directory} holds no memory; train it with train.py")
-    for name, shape in model.shapes.items():
-        count = int(model.memory(name).memory.count)
-        if count != shape.capacity:
-            raise ValueError(
-                f"checkpoint {directory}: the memory {name} holds {count} associations, "
-                f"expected {shape.capacity}; train again with train.py"
-            )
 
 
 def features(body: Body) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -127,6 +119,8 @@ def features(body: Body) -> tuple[dict[str, Any], dict[str, Any]]:
     observations = {STATE: {"type": "STATE", "shape": [joints]}}
     if body.channels:
         observations[TACTILE] = {"type": "STATE", "shape": [body.readings]}
+    for name, entries in body.observations.items():
+        observations[name] = {"type": "ENV", "shape": [entries]}
     return observations, {ACTION: {"type": "ACTION", "shape": [joints]}}
 
 
@@ -135,7 +129,7 @@ def processors(observations: dict[str, Any], actions: dict[str, Any]) -> dict[st
 
     LeRobot sets the steps' options by name when it loads them, so none may be left out.
     """
-    identity = {"STATE": "IDENTITY", "ACTION": "IDENTITY"}
+    identity = {"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"}
 
     def step(name: str, **config: Any) -> dict[str, Any]:
         return {"registry_name": name, "config": config}

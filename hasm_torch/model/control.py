@@ -1,128 +1,130 @@
-"""Walking through a memory, spike by spike.
+"""Moving a reference by what is recalled, spike by spike.
 
-The reference is the joint state that the robot is asked to take. A spike of a touched patch moves
-it along the straight segment to the recalled successor by 1/pace of a joint range; at the
-successor the next one is recalled. Without spikes nothing moves, so the robot holds still.
+The reference is the joint state that the robot is asked to take.
 
-A control step handles a few numbers at a time, which NumPy does in float64 and a fraction of the
-time that tensors take.
+    displacement    every spike of a touched patch moves it by the recalled displacement of a spike
+    goal            every spike moves it on along the course that was recalled when the touch began
+    successor       the same towards the recalled next state; there the next one is recalled
+
+Without spikes nothing moves, so the robot holds still. A control step handles a few numbers at a
+time, which NumPy does in float64 and a fraction of the time that tensors take.
 """
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hasm_torch.encoders.skin import SkinState
-from hasm_torch.encoders.skin_filter import FilterState
-from hasm_torch.model.patch_memory import PatchMemory
+from hasm_torch.encoders.skin import ArrayState
+from hasm_torch.model.moments import Moments
 
 Array = NDArray[np.float64]
-
-# A walk that needs more recalls than this in one control step waits for the next one, which
-# bounds the time a step takes.
-RECALLS_A_STEP = 4
 
 # Of the joints' speed limits, this much is used: the servo that follows needs the rest.
 SPEED_SHARE = 0.9
 
 
-@dataclass
-class Goal:
-    """A recalled successor on the way to which the reference is.
+class Touched(NamedTuple):
+    """One patch that spikes in a control step.
 
     Attributes:
-        positions: (J,) positions of the patch's joints, rad or m.
-        pace: Spikes a full joint range.
-        moved: (J,) which of the joints the touch moves.
+        patch: Its index.
+        spikes: Spikes in the step.
+        density: Rate density ρ.
+        direction: (3,) direction of the force.
+        observation: (N,) further observations.
     """
 
-    positions: Array
-    pace: float
-    moved: NDArray[np.bool_]
+    patch: int
+    spikes: float
+    density: float
+    direction: Array
+    observation: Array
 
 
 @dataclass
-class Walk:
-    """Where one robot is in its memories.
+class Course:
+    """Where a touch leads.
 
     Attributes:
-        reference: (joints,) the joint state asked for, None before the first valid reading.
-        goals: The successor that each patch is heading for.
-        levels: Stored rate density that stands for the touch of each patch.
-        quiet: Control steps since each patch last spiked.
+        points: (N, J) positions of the moved joints on the way, rad or m.
+        spikes: (N,) spikes from the first point to each.
+        done: Spikes spent on the way so far.
     """
 
-    reference: Array | None = None
-    goals: dict[str, Goal] = field(default_factory=dict)
-    levels: dict[str, float] = field(default_factory=dict)
-    quiet: dict[str, int] = field(default_factory=dict)
+    points: Array
+    spikes: Array
+    done: float = 0.0
+
+    @property
+    def finished(self) -> bool:
+        """Whether its last point is reached."""
+        return self.done >= self.spikes[-1]
+
+    def join(self, positions: Array, span: Array) -> None:
+        """Begin at the point nearest to positions (J,), in shares of the joints' spans (J,)."""
+        away = (np.abs(self.points - positions) / span).max(axis=1)
+        self.done = float(self.spikes[int(away.argmin())])
+
+    def advance(self, positions: Array, spikes: float) -> tuple[Array, float]:
+        """Move on by some spikes.
+
+        The way to the next point shrinks in step with the spikes to it, so that a reference beside
+        the course comes back to it.
+
+        Args:
+            positions: (J,) where the reference is, rad or m.
+            spikes: Spikes to spend.
+
+        Returns:
+            (J,) where it is then, and the spikes that are left over at the end of the course.
+        """
+        while spikes > 0 and not self.finished:
+            ahead = int(np.searchsorted(self.spikes, self.done, side="right"))
+            needed = float(self.spikes[ahead]) - self.done
+            if spikes < needed:
+                self.done += spikes
+                return positions + spikes / needed * (self.points[ahead] - positions), 0.0
+            positions, spikes, self.done = self.points[ahead], spikes - needed, self.spikes[ahead]
+        return (self.points[-1] if self.finished else positions), spikes
 
 
 @dataclass
 class Rollout:
-    """What one robot's control loop needs to go on; several robots can share the memories.
+    """What one robot's control loop needs to go on; several robots can share the memory.
 
     Attributes:
-        spikes: Spikes of every patch in the last control steps, (patches,) each.
+        spikes: Spikes of every patch in the last control steps, (patches,) each; as many steps as
+            rates are counted over.
+        total: (patches,) their sum.
         density: (patches,) rate density ρ of every patch at the last step.
-        touched: Patches with a memory that spiked in the last step.
-        filter: State of what cleans the skin's readings.
         skin: State of the skin's encoder.
-        walk: Where the robot is in the memories.
+        touched: Names of the taught patches that spiked in the last step.
+        reference: (J,) the joint state asked for; None before the first valid reading.
+        courses: The course of each patch whose touch goes on, by its index.
+        queries: Patch and query (D,) of every recall of the last step.
+        history: Measured positions, (J,) each, of a robot that time moves on.
+        moment: What was last asked of its memory.
     """
 
     spikes: deque[Array]
+    total: Array
     density: Array
+    skin: ArrayState | None
     touched: list[str] = field(default_factory=list)
-    filter: FilterState | None = None
-    skin: SkinState | None = None
-    walk: Walk = field(default_factory=Walk)
+    reference: Array | None = None
+    courses: dict[int, Course] = field(default_factory=dict)
+    queries: list[tuple[int, Tensor]] = field(default_factory=list)
+    history: list[Array] = field(default_factory=list)
+    moment: Moments | None = None
 
-
-def advance(
-    reference: Array,
-    walk: Walk,
-    patch: str,
-    memory: PatchMemory,
-    spikes: float,
-    density: float,
-    link: Tensor | None = None,
-) -> Array:
-    """Move the reference by a number of spikes of one patch.
-
-    Args:
-        reference: (joints,) joint positions, rad or m.
-        walk: Holds the patch's goal and touch level between calls.
-        patch: Name of the patch.
-        memory: The patch's memory.
-        spikes: Spikes to spend.
-        density: Rate density ρ of the patch.
-        link: (3, 3) rotation of the patch's link, see ``PatchMemory.codes``.
-
-    Returns:
-        (joints,) the moved reference; joints that the memory does not code stay.
-    """
-    coded = reference[memory.coded]
-    level = walk.levels[patch] = memory.touch_level(density, walk.levels.get(patch))
-    for _ in range(RECALLS_A_STEP):
-        goal = walk.goals.get(patch)
-        if goal is None:
-            goal = walk.goals[patch] = Goal(*memory.follow(coded, level, link, patch))
-        way = np.where(goal.moved, goal.positions - coded, 0.0)
-        needed = goal.pace * float(np.abs(way / memory.span).max())
-        if needed > spikes:
-            coded = coded + way * (spikes / needed)
-            break
-        coded, spikes = np.where(goal.moved, goal.positions, coded), spikes - needed
-        del walk.goals[patch]
-        if needed == 0 or spikes == 0:
-            break
-    moved = reference.copy()
-    moved[memory.coded] = coded
-    return moved
+    def count(self, spikes: Array) -> None:
+        """Take in the spikes of a step, (patches,)."""
+        self.total += spikes - self.spikes.popleft()
+        self.spikes.append(spikes)
 
 
 def limit_speed(before: Array, after: Array, max_speed: Array, period: float) -> Array:

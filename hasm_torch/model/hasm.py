@@ -1,182 +1,115 @@
 """The whole model: skin forces and joint positions in, joint targets out.
 
-joint positions ──PlaceCode──► s ┐
-skin forces ──EffectiveForce──Izhikevich──► ρ ──TactileEmbedding──► F ──RoPE3D──► o ┤
-                                    m = s ⊗ o ──HeteroAssociativeMemory──► joint targets
+joint positions ──PlaceCode──────────────────────────────────────────► s ┐
+skin forces ──EffectiveForce──Izhikevich──► ρ ──TactileEmbedding──► F     │
+            ──cell normals, link rotation──► f̂ ──RoPE3D(F; f̂, θ)──────► o ┤ q = s ⊗ o ⊗ p
+further observations ──PlaceCode─────────────────────────────────────► p ┘
+                      d = S₋₁ softmax(β Mᵀ q),   reference += spikes · d
 """
 
 from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from hasm_torch.body import Body
-from hasm_torch.config import SHARED, HASMConfig, MemoryShape
+from hasm_torch.config import HASMConfig
 from hasm_torch.encoders.readings import forces_of
-from hasm_torch.encoders.skin import SkinEncoder, spike_step
-from hasm_torch.encoders.skin_filter import FilterState, clean_skin
+from hasm_torch.encoders.skin import SkinEncoder
+from hasm_torch.encoders.touch import spike_density
 from hasm_torch.model import checkpoint
-from hasm_torch.model.control import Array, Rollout, Walk, advance, limit_speed
-from hasm_torch.model.learning import FitReport, Recording, learn
-from hasm_torch.model.patch_memory import PatchMemory
+from hasm_torch.model.control import Array, Rollout, Touched, limit_speed
+from hasm_torch.model.felt import PushDirection, Recording, rate_window, skin_encoder
+from hasm_torch.model.fit import FitReport, fit, timed_series
+from hasm_torch.model.frames import base_indices
+from hasm_torch.model.moments import moments
+from hasm_torch.model.query import parts_of
+from hasm_torch.model.recalling import Recalling
+from hasm_torch.model.settled import Settled
+from hasm_torch.model.timed import Timed
 
-if TYPE_CHECKING:
-    from hasm_torch.robot import Kinematics
-
-# A patch that was quiet this long is touched anew, s.
-ONSET_AFTER = 0.2
+# A walk that needs more recalls than this in one control step waits for the next one, which
+# bounds the time a step takes.
+RECALLS_A_STEP = 4
 
 
 class HASM(nn.Module):
-    """Encoders and one dedicated memory a skin patch, or one that all patches share.
+    """Encoders and the memory that all skin patches share.
 
     ``fit`` stores episodes, ``step`` gives the joint target of one control step, ``reset`` starts
     a new rollout.
 
     Attributes:
-        memories: The memories that hold something: one a patch, by its name, or the shared one.
-        patches: Names of the patches that have learned something.
+        settled: What was chosen for the episodes; None before the first ``fit``.
+        recalling: The memory with its codes; of a robot that time moves on a ``Timed`` one.
         rollout: The control loop that ``step`` goes on with unless it is given another.
-        tolerance: (joints,) how far a joint may be from its reference before the reference waits
-            or, at a new touch, follows the joint, rad or m.
-        footprint: (cells,) share of its patch's force that each cell took at every touch of the
-            episodes, see ``skin_filter``.
+        tolerance: (joints,) how far the reference may be from a joint, rad or m.
 
     Args:
         config: Settings of the method.
         body: Joints and skin of the robot.
-        shapes: Shapes of the memories by patch, of a model to be loaded; ``fit`` finds them.
+        settled: What was chosen, of a model to be loaded; ``fit`` finds it.
     """
 
     tolerance: Tensor
-    footprint: Tensor
-    lower: Tensor
-    upper: Tensor
-    max_speed: Tensor
 
-    def __init__(
-        self, config: HASMConfig, body: Body, shapes: dict[str, MemoryShape] | None = None
-    ) -> None:
+    def __init__(self, config: HASMConfig, body: Body, settled: Settled | None = None) -> None:
         super().__init__()
         self.config, self.body = config, body
-        self._kinematics: Kinematics | None = None
-        self.skin = SkinEncoder(
-            body.cells,
-            body.rate,
-            config.threshold,
-            config.force_window,
-            config.current_per_newton,
-            spike_step(body.rate, config.spike_dt_ms),
-        )
-        self.shapes: dict[str, MemoryShape] = {}
-        self.memories = nn.ModuleDict()
-        for patch, shape in (shapes or {}).items():
-            self.add_memory(patch, shape)
-        self.register_buffer("lower", torch.tensor(body.lower, dtype=torch.float32))
-        self.register_buffer("upper", torch.tensor(body.upper, dtype=torch.float32))
-        self.register_buffer("max_speed", torch.tensor(body.max_speed, dtype=torch.float32))
+        self._base = base_indices(body)
+        self._direction = PushDirection(body, config.frame)
         # As the float32 that targets are given in, so that none is rounded across a limit.
         self._lower, self._upper, self._max_speed = (
             np.array(limit, dtype=np.float32).astype(np.float64)
             for limit in (body.lower, body.upper, body.max_speed)
         )
-        self.register_buffer("tolerance", 0.1 * (self.upper - self.lower))
-        self.register_buffer("footprint", torch.zeros(sum(body.cells)))
+        self.register_buffer("tolerance", torch.zeros(len(body.joints)))
+        self.settled: Settled | None = None
+        self.recalling: Recalling | Timed | None = None
+        self.skin: SkinEncoder | None = None
+        if settled is not None:
+            timed = settled.drive == "time"
+            self._settle(settled, (Timed if timed else Recalling)(config, body, settled))
         self.reset()
 
-    def add_memory(self, name: str, shape: MemoryShape) -> PatchMemory:
-        """Make an empty memory, in place of the one of that name.
-
-        Args:
-            name: The patch that it belongs to, or ``SHARED`` where the shape names the patches.
-            shape: What it holds.
-
-        Raises:
-            ValueError: If a patch is not the body's.
-        """
-        for served in shape.patches or [name]:
-            if served not in self.body.patches:
-                raise ValueError(f"unknown patch {served!r}, valid: {', '.join(self.body.patches)}")
-        index = 0 if shape.patches else self.body.patches.index(name)
-        memory = PatchMemory(self.config, self.body, index, shape)
-        self.shapes[name], self.memories[name] = shape, memory
-        return memory
-
-    @property
-    def patches(self) -> list[str]:
-        """Names of the patches that have learned something."""
-        return [patch for name, shape in self.shapes.items() for patch in shape.patches or [name]]
-
-    def memory(self, patch: str) -> PatchMemory:
-        """The memory of a patch that has learned something."""
-        memory = self.memories[SHARED if self.config.memories == "shared" else patch]
-        assert isinstance(memory, PatchMemory)
-        return memory
-
-    def link_rotation(self, patch: str, positions: Tensor) -> Tensor | None:
-        """Rotation of a patch's link in the base frame, by forward kinematics.
-
-        Args:
-            patch: Name of the patch.
-            positions: (..., joints) joint positions, rad or m.
-
-        Returns:
-            (..., 3, 3), or None where touches are told apart in the link's own frame.
-
-        Raises:
-            ValueError: If the body does not say which link carries the patch, or a joint or link
-                is not the bundled HSR's.
-        """
-        if self.config.frame == "link":
-            return None
-        if not self.body.links:
-            raise ValueError('frame="base" needs the link of every patch: give Body(links=...)')
-        if self._kinematics is None:
-            from hasm_torch.robot import Kinematics
-
-            self._kinematics = Kinematics(device=str(positions.device))
-        named = dict(zip(self.body.joints, positions.unbind(-1)))
-        pose = self._kinematics.forward_named(named)[
-            self.body.links[self.body.patches.index(patch)]
-        ]
-        return pose[..., :3, :3]
+    def _settle(self, settled: Settled, recalling: Recalling | Timed) -> None:
+        unknown = [name for name in settled.taught if name not in self.body.patches]
+        if unknown:
+            raise ValueError(
+                f"unknown patches {', '.join(unknown)}, valid: {', '.join(self.body.patches)}"
+            )
+        device = self.tolerance.device
+        scale = settled.threshold, settled.current_per_newton
+        self.skin = skin_encoder(self.config, self.body, *scale).to(device)
+        self.settled, self.recalling = settled, recalling.to(device)
+        # A patch that was never touched is answered where one on the same rigid body was.
+        parts = parts_of(self.body, settled.touch)
+        taught = {parts[self.body.patches.index(name)] for name in settled.taught}
+        self._answers = np.array([part in taught for part in parts])
 
     def fit(self, episodes: Iterable[Recording]) -> FitReport:
-        """Store episodes; see ``learning.learn``.
+        """Learn episodes, in place of what was learned before; see ``model.fit``.
 
         Args:
-            episodes: Recordings with ``time``, ``state``, ``action`` and ``tactile``.
+            episodes: Recordings with ``time``, ``state``, ``action`` and ``tactile``, and
+                ``observations`` where the body binds some.
 
         Returns:
-            What was stored.
+            What was learned and chosen.
 
         Raises:
-            ValueError: If there is no episode, no touch, or a value is not finite.
+            ValueError: If there is no episode, no touch, no motion, or a value is not finite; the
+                model is then as it was.
         """
-        report = learn(self, episodes)
+        fitted = fit(self.config, self.body, episodes)
+        self._settle(fitted.settled, fitted.memory)
+        self.tolerance.copy_(fitted.tolerance)
         self.reset()
-        return report
-
-    def clean(
-        self, forces: Tensor, state: FilterState | None = None
-    ) -> tuple[Tensor, FilterState | None]:
-        """What a sound skin would have read, see ``skin_filter``.
-
-        Args:
-            forces: (T, cells, 3), N.
-            state: What an earlier chunk returned.
-
-        Returns:
-            (T, cells, 3), N; the state to go on from.
-        """
-        if not self.body.channels:
-            return forces, None
-        footprint = self.footprint.cpu().numpy()
-        return clean_skin(forces, self.body.cells, self.body.rate, footprint, state)
+        return fitted.report
 
     def reset(self) -> None:
         """Forget the rollout: the next step starts from the measured joints."""
@@ -184,11 +117,18 @@ class HASM(nn.Module):
 
     def new_rollout(self) -> Rollout:
         """A control loop at its beginning, for ``step``."""
-        window = max(1, round(self.config.rate_window_s * self.body.rate))
-        return Rollout(deque(maxlen=window), np.zeros(len(self.body.patches)))
+        nothing: Array = np.zeros(len(self.body.patches))
+        spikes: deque[Array] = deque([nothing] * rate_window(self.config, self.body))
+        return Rollout(spikes, nothing.copy(), nothing, self.skin.start() if self.skin else None)
 
     @torch.no_grad()
-    def step(self, state: Tensor, skin: Tensor | None, rollout: Rollout | None = None) -> Tensor:
+    def step(
+        self,
+        state: Tensor,
+        skin: Tensor | None,
+        rollout: Rollout | None = None,
+        observation: Tensor | None = None,
+    ) -> Tensor:
         """One control step.
 
         Args:
@@ -196,6 +136,7 @@ class HASM(nn.Module):
             skin: (cells, channels) or flat, the skin's readings in the body's layout; None for a
                 robot without skin.
             rollout: The control loop to go on with, one a robot; by default the model's own.
+            observation: (N,) further observations, where the body binds some.
 
         Returns:
             (joints,) target joint positions, within the joint limits. A reading that is not
@@ -206,42 +147,174 @@ class HASM(nn.Module):
             RuntimeError: If the model has learned nothing, or the very first joint reading is
                 not finite, so that there is nothing to hold.
         """
-        measured, forces = self._checked(state, skin)
+        measured, forces, observed = self._checked(state, skin, observation)
         rollout = self.rollout if rollout is None else rollout
-        walk = rollout.walk
+        rollout.queries, rollout.touched = [], []
         known = bool(np.isfinite(measured).all())
-        if walk.reference is None:
+        if rollout.reference is None:
             if not known:
                 raise RuntimeError("no finite joint reading yet, so there is no position to hold")
-            walk.reference = np.clip(measured, self._lower, self._upper)
-        if not (known and bool(torch.isfinite(forces).all())):
-            rollout.touched = []
-            return self._target(walk.reference, state)
-        felt, rollout.filter = self.clean(forces.unsqueeze(0), rollout.filter)
-        spikes, _, rollout.skin = self.skin(felt, rollout.skin)
-        counts = spikes[0].cpu().numpy().astype(np.float64)
-        rollout.spikes.append(counts)
-        rollout.density = density = self._density(rollout.spikes)
-        patches = self.patches
-        rollout.touched = touched = [
-            patch
-            for patch, count in zip(self.body.patches, counts)
-            if count > 0 and patch in patches
+            rollout.reference = np.clip(measured, self._lower, self._upper)
+        if known and np.isfinite(forces).all() and np.isfinite(observed).all():
+            target = self._moved(rollout, measured, forces, observed)
+            target = limit_speed(rollout.reference, target, self._max_speed, 1 / self.body.rate)
+            rollout.reference = np.clip(target, self._lower, self._upper)
+        return torch.from_numpy(rollout.reference.astype(np.float32)).to(state.device)
+
+    def _moved(
+        self, rollout: Rollout, measured: Array, forces: NDArray[np.float32], observed: Array
+    ) -> Array:
+        """Where the reference goes in one control step."""
+        assert self.skin is not None
+        assert rollout.skin is not None
+        assert rollout.reference is not None
+        felt, means, rollout.skin = self.skin.encode(forces[None, None], rollout.skin)
+        counts, push = felt[0, 0].astype(np.float64), means[0, 0, :, 1:]
+        rollout.count(counts)
+        seconds = len(rollout.spikes) / self.body.rate
+        rollout.density = spike_density(rollout.total / seconds, self.config.max_rate)
+        touched = np.flatnonzero((counts > 0) & self._answers).tolist()
+        rollout.touched = [self.body.patches[p] for p in touched]
+        if isinstance(self.recalling, Timed):
+            return measured + self._onward(rollout, measured) / self.config.horizon
+        if not touched:
+            return rollout.reference
+        assert self.settled is not None
+        direction = self._direction.of_patch
+        touches = [
+            Touched(
+                p, counts[p], rollout.density[p], direction(p, push[p], rollout.reference), observed
+            )
+            for p in touched
         ]
-        self._note_onsets(walk, touched, measured)
-        target = walk.reference
-        for patch in touched:
-            index = self.body.patches.index(patch)
-            touch = (float(counts[index]), float(density[index]))
-            target = self._move(walk, target, patch, *touch, measured)
-        if touched:
-            target = limit_speed(walk.reference, target, self._max_speed, 1.0 / self.body.rate)
-            walk.reference = np.clip(target, self._lower, self._upper)
-        return self._target(walk.reference, state)
+        tolerance = self.tolerance.cpu().numpy()
+        if self.settled.value == "displacement":
+            target = rollout.reference
+            for touch in touches:
+                target = target + touch.spikes * self._displacement(rollout, touch)
+            # A joint that is held up does not run away from its reference; the others go on.
+            return np.clip(target, measured - tolerance, measured + tolerance)
+        return self._along_courses(rollout, touches, measured, tolerance)
+
+    def _onward(self, rollout: Rollout, measured: Array) -> Array:
+        """Displacement over the horizon of a robot that time moves on, (joints,)."""
+        assert isinstance(self.recalling, Timed)
+        assert self.settled is not None
+        rollout.history.append(measured)
+        del rollout.history[: -1 - max(self.settled.past)]
+        touch = rollout.density[None, :] if self.body.channels else np.zeros((1, 0))
+        rollout.moment = self.recalling.moment(np.array(rollout.history), touch)
+        return self.recalling(rollout.moment)[0].cpu().numpy()
+
+    def _displacement(self, rollout: Rollout, touch: Touched) -> Array:
+        """What a spike of a touch does to the reference, (joints,)."""
+        assert isinstance(self.recalling, Recalling)
+        assert rollout.reference is not None
+        query = self.recalling.query(rollout.reference, touch)
+        rollout.queries.append((touch.patch, query))
+        yaw = float(rollout.reference[self._base[2]]) if self._base else 0.0
+        return self.recalling.displacement(query, touch, yaw)
+
+    def _along_courses(
+        self, rollout: Rollout, touches: list[Touched], measured: Array, tolerance: Array
+    ) -> Array:
+        """The reference moved along the course of every touch."""
+        assert isinstance(self.recalling, Recalling)
+        assert self.settled is not None
+        assert rollout.reference is not None
+        moved = np.array(self.settled.moved)
+        here = {touch.patch for touch in touches}
+        for patch in [p for p in rollout.courses if p not in here]:
+            del rollout.courses[patch]  # another patch leads away from this course
+        away = np.abs(measured - rollout.reference) > tolerance
+        if away[moved].any():
+            if all(touch.patch in rollout.courses for touch in touches):
+                return rollout.reference  # the joints are held up: wait for them
+            rollout.reference = np.where(
+                away, np.clip(measured, self._lower, self._upper), rollout.reference
+            )
+        target = rollout.reference.copy()
+        for touch in touches:
+            spikes = touch.spikes
+            for _ in range(RECALLS_A_STEP):
+                course = rollout.courses.get(touch.patch)
+                walking = self.settled.value == "successor"
+                if course is None or (walking and course.finished):
+                    query = self.recalling.query(target, touch)
+                    rollout.queries.append((touch.patch, query))
+                    yaw = float(target[self._base[2]]) if self._base else 0.0
+                    course = self.recalling.course(query, touch, target, yaw)
+                    rollout.courses[touch.patch] = course
+                if walking and not self.config.distinct:
+                    target[moved] = course.points[-1]
+                    del rollout.courses[touch.patch]
+                    break
+                target[moved], spikes = course.advance(target[moved], spikes)
+                if not spikes or not walking:
+                    break
+        return target
+
+    @torch.no_grad()
+    def predict(
+        self, episode: Recording, ahead: int, most: int = 10**9
+    ) -> tuple[Array, NDArray[np.int64]]:
+        """Where the joints will be, in an episode that is watched: open-loop prediction.
+
+        A robot that time moves on is predicted by one recall. One that touch moves is stepped on
+        from each frame, its skin as it is felt then, as if the joints followed at once.
+
+        Args:
+            episode: The recording.
+            ahead: Frames ahead; of a robot that time moves on the ``horizon`` of its settings.
+            most: Frames predicted at most, evenly spread.
+
+        Returns:
+            (K, joints) predicted displacements, rad or m, and the (K,) frames they start from.
+
+        Raises:
+            ValueError: If ``ahead`` is not the horizon of a robot that time moves on.
+        """
+        recalling, config = self._learned(), self.config
+        assert self.settled is not None
+        count = max(len(episode.state) - ahead, 0)
+        frames = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+        frames = frames[:count]
+        if isinstance(recalling, Timed):
+            if ahead != config.horizon:
+                raise ValueError(f"the memory looks {config.horizon} frames ahead, not {ahead}")
+            series = timed_series(config, self.body, self.settled, episode, 0)
+            found = moments([series], self.settled.past, ahead).rows(torch.from_numpy(frames))
+            return recalling(found).numpy(), frames
+        stepped = [self._stepped(episode, frame, ahead) for frame in frames]
+        return np.array(stepped).reshape(len(frames), len(self.body.joints)), frames
+
+    def _stepped(self, episode: Recording, frame: int, ahead: int) -> Array:
+        """Displacement when the robot goes on from a frame for some more, (joints,)."""
+        rollout, seconds = self.new_rollout(), self.config.rate_window_s
+        first = max(0, frame - round(2 * seconds * self.body.rate))
+        state = torch.from_numpy(np.asarray(episode.state, dtype=np.float32))
+        skin = None if episode.tactile is None else torch.from_numpy(np.asarray(episode.tactile))
+        more = getattr(episode, "observations", None)
+        seen = None if more is None else torch.from_numpy(np.asarray(more))
+        for t in range(first, frame + ahead):
+            at, here = min(t, frame), state[min(t, frame)]
+            felt, also = (None if x is None else x[at] for x in (skin, seen))
+            if t == frame:  # up to here the skin was watched, the joints as they were
+                rollout.reference, rollout.courses = here.double().numpy(), {}
+            if t > frame:
+                here = torch.from_numpy(rollout.reference).float()
+            self.step(here, felt, rollout, also)
+        assert rollout.reference is not None
+        return rollout.reference - state[frame].double().numpy()
+
+    @property
+    def patches(self) -> list[str]:
+        """Names of the patches whose touch was taught."""
+        return [] if self.settled is None else self.settled.taught
 
     @property
     def touched(self) -> list[str]:
-        """Patches with a memory that spiked in the last step."""
+        """Patches that spiked in the last step and are answered."""
         return self.rollout.touched
 
     @property
@@ -256,74 +329,51 @@ class HASM(nn.Module):
         Raises:
             RuntimeError: If no step was made since the reset.
         """
-        if self.rollout.walk.reference is None:
+        if self.rollout.reference is None:
             raise RuntimeError("no step was made since the reset, so there is no reference yet")
-        return torch.from_numpy(self.rollout.walk.reference).float()
+        return torch.from_numpy(self.rollout.reference).float()
 
-    def _move(
-        self,
-        walk: Walk,
-        reference: Array,
-        patch: str,
-        spikes: float,
-        density: float,
-        measured: Array,
-    ) -> Array:
-        memory = self.memory(patch)
-        if self.config.advance == "tick":
-            link = self.link_rotation(patch, torch.from_numpy(measured))
-            moved = reference.copy()
-            level = memory.touch_level(density)
-            now = measured[memory.coded]
-            following, _, led = memory.follow(now, level, link, patch)
-            moved[memory.coded] = np.where(led, following, moved[memory.coded])
-            return moved
-        lag = np.abs(measured - reference)[memory.coded]
-        if (lag > self.tolerance.cpu().numpy()[memory.coded]).any():
-            return reference  # the joints are held up: wait for them
-        link = self.link_rotation(patch, torch.from_numpy(reference))
-        return advance(reference, walk, patch, memory, spikes, density, link)
+    @property
+    def origins(self) -> NDArray[np.int64]:
+        """(K, 3) episode, sample and patch from which each association comes."""
+        return self._learned().origins.cpu().numpy()
 
-    def _note_onsets(self, walk: Walk, touched: list[str], measured: Array) -> None:
-        """Where a new touch begins, take up joints that were moved meanwhile."""
-        assert walk.reference is not None
-        onset = ONSET_AFTER * self.body.rate
-        anew = [patch for patch in touched if walk.quiet.get(patch, onset) >= onset]
-        if anew:
-            away = np.abs(measured - walk.reference) > self.tolerance.cpu().numpy()
-            if away.any():
-                held = np.clip(measured, self._lower, self._upper)
-                walk.reference = np.where(away, held, walk.reference)
-                walk.goals.clear()
-        for patch in list(walk.goals):
-            if touched and patch not in touched:
-                del walk.goals[patch]  # another patch leads away from this goal
-        for patch in anew:
-            walk.levels.pop(patch, None)  # how strong the new touch is shows later
-        for patch in self.patches:
-            walk.quiet[patch] = 0 if patch in touched else walk.quiet.get(patch, 0) + 1
+    def recalled(self) -> list[tuple[str, Array]]:
+        """The recalls of the last step: patch and weight of each association, (K,).
 
-    def _density(self, spikes: deque[Array]) -> Array:
-        """Rate density ρ of every patch over the last window, (patches,)."""
-        seconds = (spikes.maxlen or 1) / self.body.rate
-        return np.clip(np.sum(spikes, axis=0) / (seconds * self.config.max_rate), 0.0, 1.0)
-
-    def _checked(self, state: Tensor, skin: Tensor | None) -> tuple[Array, Tensor]:
-        if not self.memories:
-            raise RuntimeError("the model has learned nothing: call fit or from_pretrained first")
-        joints = len(self.body.joints)
-        if state.shape != (joints,):
-            raise ValueError(f"expected state ({joints},), got {tuple(state.shape)}")
-        forces = forces_of(self.body, skin).to(self.lower)
-        return state.detach().cpu().numpy().astype(np.float64), forces
-
-    def _target(self, reference: Array, state: Tensor) -> Tensor:
-        """The reference as the caller takes it, float32 on the device of the state."""
-        return torch.from_numpy(reference.astype(np.float32)).to(state.device)
+        Where time moves the robot on, no patch is named.
+        """
+        recalling, rollout = self._learned(), self.rollout
+        if isinstance(recalling, Timed):
+            return [] if rollout.moment is None else [("", recalling.weights(rollout.moment))]
+        return [(self.body.patches[p], recalling.weights(query, p)) for p, query in rollout.queries]
 
     def memory_bytes(self) -> int:
         """Bytes of all associations and successors held."""
-        return sum(memory.memory.memory_bytes() for memory in self.memories.values())  # type: ignore[union-attr, operator]
+        return self._learned().memory.memory_bytes()
+
+    def _learned(self) -> Recalling | Timed:
+        if self.recalling is None:
+            raise RuntimeError("the model has learned nothing: call fit or from_pretrained first")
+        return self.recalling
+
+    def _checked(
+        self, state: Tensor, skin: Tensor | None, observation: Tensor | None
+    ) -> tuple[Array, NDArray[np.float32], Array]:
+        self._learned()
+        joints, more = len(self.body.joints), sum(self.body.observations.values())
+        if state.shape != (joints,):
+            raise ValueError(f"expected state ({joints},), got {tuple(state.shape)}")
+        if more and (observation is None or observation.shape != (more,)):
+            came = None if observation is None else tuple(observation.shape)
+            raise ValueError(
+                f"expected observation ({more},) of {', '.join(self.body.observations)}, got {came}"
+            )
+        forces = forces_of(self.body, skin).detach().cpu().float().contiguous().numpy()
+        observed = np.zeros(0)
+        if more and observation is not None:
+            observed = observation.detach().cpu().numpy().astype(np.float64)
+        return state.detach().cpu().numpy().astype(np.float64), forces, observed
 
     def save_pretrained(self, directory: str | Path) -> None:
         """Write a checkpoint; see ``checkpoint``.
@@ -334,7 +384,13 @@ class HASM(nn.Module):
         Raises:
             RuntimeError: If the model has learned nothing.
         """
-        checkpoint.save(self, Path(directory))
+        self._learned()
+        assert self.settled is not None
+        checkpoint.save(
+            checkpoint.Settings(self.config, self.body, self.settled),
+            self.state_dict(),
+            Path(directory),
+        )
 
     @classmethod
     def from_pretrained(cls, directory: str | Path) -> "HASM":
@@ -346,7 +402,7 @@ class HASM(nn.Module):
         """
         settings = checkpoint.read_settings(Path(directory))
         try:
-            model = cls(settings.config, settings.body, settings.shapes)
+            model = cls(settings.config, settings.body, settings.settled)
         except (ValueError, LookupError, TypeError, RuntimeError) as error:
             raise checkpoint.damaged(Path(directory), error) from error
         checkpoint.load_weights(model, Path(directory))

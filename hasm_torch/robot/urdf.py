@@ -1,6 +1,7 @@
 """What forward kinematics needs from a URDF, read in float64."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -24,7 +25,8 @@ class UrdfJoint:
 
     Attributes:
         name: joint name.
-        type: ``"revolute"``, ``"prismatic"`` or ``"fixed"``; ``continuous`` is read as revolute.
+        type: ``"revolute"``, ``"prismatic"`` or ``"fixed"``; ``continuous`` is read as revolute
+            without position limits.
         parent: link before the joint.
         child: link behind the joint.
         origin: (4, 4) float64, pose of the joint in the parent link, m.
@@ -60,6 +62,24 @@ class Urdf:
     root: str
     links: tuple[str, ...]
     joints: dict[str, UrdfJoint]
+
+    def rule(self, name: str, given: Sequence[str]) -> tuple[str | None, float, float]:
+        """Where the position of a joint comes from if some joints are given.
+
+        Args:
+            name: a joint.
+            given: joints whose positions are known; all others stand at 0.
+
+        Returns:
+            A joint of ``given`` or None, multiplier and offset:
+            ``q[name] = multiplier * q[joint] + offset``.
+        """
+        if name in given:
+            return name, 1.0, 0.0
+        mimic = self.joints[name].mimic
+        if mimic is None:
+            return None, 0.0, 0.0
+        return (mimic.joint if mimic.joint in given else None), mimic.multiplier, mimic.offset
 
 
 def read_urdf(path: str | Path) -> Urdf:
@@ -100,7 +120,8 @@ def read_urdf(path: str | Path) -> Urdf:
 
 def _read_joint(element: ElementTree.Element) -> UrdfJoint:
     name, kind = element.attrib["name"], element.attrib["type"]
-    kind = "revolute" if kind == "continuous" else kind
+    endless = kind == "continuous"
+    kind = "revolute" if endless else kind
     if kind not in ("revolute", "prismatic", "fixed"):
         raise ValueError(
             f"joint {name!r} is of type {kind!r}; "
@@ -117,8 +138,8 @@ def _read_joint(element: ElementTree.Element) -> UrdfJoint:
         origin=_pose({} if origin is None else origin.attrib),
         # A URDF without <axis> means x.
         axis=(1.0, 0.0, 0.0) if axis is None else _triple(axis.attrib["xyz"]),
-        lower=float(bounds.get("lower", -math.inf)),
-        upper=float(bounds.get("upper", math.inf)),
+        lower=-math.inf if endless else float(bounds.get("lower", -math.inf)),
+        upper=math.inf if endless else float(bounds.get("upper", math.inf)),
         velocity=float(bounds.get("velocity", math.inf)),
         mimic=None
         if mimic is None

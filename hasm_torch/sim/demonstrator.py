@@ -1,160 +1,214 @@
-"""Teaching by touch: the recorded episodes of both experiments.
+"""Teaching by touch: the recorded episodes of all experiments.
 
-The demonstrator's robot yields by an analytic rule: while a patch is touched, the taught motion
-advances at a speed proportional to the force that the skin feels. What the episodes hold is the
-joints, the skin and the joint targets; the rule itself is not in them.
+    human ──touch──► HSRTouchEnv ──joints, skin──► Teacher ──target──► HSRTouchEnv
+                                        └────────────┴──────► Episode
+
+What the episodes hold is joints, skin and joint targets; the teacher's law is not in them. All
+teaching is done with one force, `TEACHING_FORCE`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from torch import from_numpy
 
-from hasm_torch.data.episodes import Episode
-from hasm_torch.evaluation.compliance import BEHAVIOURS, Behaviour
-from hasm_torch.evaluation.grasp import GRASP_PATCH, REACH_PATCH, noisy_start
+from hasm_torch.episode import Episode
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.env import CONTROL_RATE, HSRTouchEnv
-from hasm_torch.sim.poses import GRASP_POSES, START_POSES
+from hasm_torch.sim.tasks import (
+    BASE_JOINTS,
+    BASE_PLACE,
+    BEHAVIOURS,
+    COMPLIANCE_EPISODES,
+    GRASP,
+    GRASP_PATCH,
+    GRASP_PAUSE,
+    OBJECT_PLACES,
+    PUSH_GAP,
+    PUSH_SECONDS,
+    PUSH_TILT,
+    REACH_PATCH,
+    START_NOISE,
+    START_POSES,
+    TEACHING_FORCE,
+    TORSO_PATCHES,
+    TREMOR,
+    TREMOR_RATE,
+    WRIST_PATCHES,
+    YIELD_TORSO,
+    YIELD_WRIST,
+    Behaviour,
+    noisy_start,
+    random_posture,
+    upright_posture,
+)
+from hasm_torch.sim.teacher import ComplianceTeacher, GraspTeacher, Teacher, YieldTeacher
 
 Array = NDArray[np.float64]
 
-# Speed of a taught motion, joint ranges a second for each newton: 10 N turn the wrist by
-# 0.7 rad/s, half its limit; in a grasp 10 N lift the arm by 0.14 m/s.
-COMPLIANCE_SPEED, GRASP_SPEED = 0.0125, 0.02
-COMPLIANCE_FORCES = (3.0, 6.0, 10.0)  # N
-GRASP_FORCES = (4.0, 7.0, 10.0)  # N
-TASKS = {
-    "arm_down": "push the arm down at the upper side of the wrist",
-    "arm_up": "push the arm up at the under side of the wrist",
-    "wrist_left": "turn the wrist at its left side",
-    "wrist_right": "turn the wrist at its right side",
-    "grasp": "reach by the upper side of the wrist, grasp and retract by its right side",
-}
-REACH_PATH = np.array([GRASP_POSES[pose] for pose in ("before", "around")])
-GRASP_PATH = np.array([GRASP_POSES[pose] for pose in ("closed", "lifted")])
-# Other joints' postures during the one-joint episodes, shares of their ranges.
-POSTURE = (0.3, 0.5, 0.5, 0.5, 0.5, 0.6, 0.6, 0.5)
+FLEX = JOINTS.index("arm_flex_joint")
 
 
 class _Recorder:
     """Steps the environment under one episode's touches and keeps what it saw."""
 
-    def __init__(self, env: HSRTouchEnv, start: Array, offset: tuple[float, float]) -> None:
-        self.env, self.target = env, start.copy()
-        options = {"joints": start, "object": offset}
-        self.observation, _ = env.reset(seed=0, options=options)
-        self.rows: list[tuple[NDArray[np.float32], NDArray[np.float32], Array]] = []
+    def __init__(self, teacher: Teacher, start: Array, place: Sequence[float] = (0.0, 0.0)) -> None:
+        self.teacher, self.env = teacher, teacher.env
+        self.observation, _ = self.env.reset(seed=0, options={"joints": start, "object": place})
+        teacher.reset()
+        self.rows: list[tuple[NDArray[np.float32], ...]] = []
 
-    def step(self, patch: str | None, force: float) -> float:
-        """One control step towards the target; returns the force felt by the patch, N."""
-        self.env.touch(patch, force)
-        state, tactile = self.observation["state"], self.observation["tactile"]
-        self.rows.append((state, tactile, self.target.copy()))
-        self.observation, *_ = self.env.step(self.target.astype(np.float32))
-        felt = self.env.skin_forces
-        return float(felt[self.env.skin.slices[patch]].sum()) if patch else 0.0
+    def step(self, patch: str | None, force: float = 0.0, cell: int | None = None) -> None:
+        """One control step."""
+        self.env.touch(patch, force, cell)
+        state, skin, *bound = self.observation.values()
+        target = self.teacher.step(from_numpy(state), from_numpy(skin)).numpy()
+        self.rows.append((state, target, skin, *bound))
+        self.observation, *_ = self.env.step(target)
 
-    def rest(self, seconds: float) -> None:
-        """Leave the robot alone."""
+    def steps(self, seconds: float, patch: str | None = None, force: float = 0.0) -> None:
+        """An even touch of a patch's middle, or rest."""
         for _ in range(round(seconds * CONTROL_RATE)):
-            self.step(None, 0.0)
+            self.step(patch, force)
 
     def episode(self, index: int, task: str) -> Episode:
         """Everything seen so far."""
-        state, tactile, action = (np.array(column, np.float32) for column in zip(*self.rows))
+        state, action, skin, *bound = (np.array(column) for column in zip(*self.rows))
         return Episode(
             index=index,
             task=task,
             time=np.arange(len(state)) / CONTROL_RATE,
             state=state,
             action=action,
-            tactile=tactile.reshape(len(state), -1, 3),
+            tactile=skin.reshape(len(state), -1, 3),
+            observations=bound[0] if bound else None,
         )
 
 
-def compliance_episodes(forces: tuple[float, ...] = COMPLIANCE_FORCES) -> Iterator[Episode]:
-    """Record each one-joint behaviour over the whole range of its joint, once a force.
+def yield_episodes(count: int, torso: bool, generator: np.random.Generator) -> Iterator[Episode]:
+    """Record pushes to which the robot yields: every patch in turn, in one random posture.
 
-    Args:
-        forces: Forces of the touches, N.
-
-    Yields:
-        Episodes, one for each behaviour and force.
-    """
-    env = HSRTouchEnv("compliance")
-    index = 0
-    for behaviour in BEHAVIOURS:
-        for force in forces:
-            yield _compliance_episode(env, behaviour, force, index)
-            index += 1
-    env.close()
-
-
-def _compliance_episode(
-    env: HSRTouchEnv, behaviour: Behaviour, force: float, index: int
-) -> Episode:
-    joint = JOINTS.index(behaviour.joint)
-    lower, upper = env.joint_lower, env.joint_upper
-    start = lower + np.array(POSTURE) * (upper - lower)
-    begin, end = (lower, upper) if behaviour.direction > 0 else (upper, lower)
-    start[joint] = begin[joint]
-    recorder = _Recorder(env, start, (0.0, 0.0))
-    recorder.rest(0.2)
-    while recorder.target[joint] != end[joint]:
-        felt = recorder.step(behaviour.patch, force)
-        travel = COMPLIANCE_SPEED * felt / CONTROL_RATE * (end - begin)[joint]
-        moved = recorder.target[joint] + travel
-        recorder.target[joint] = np.clip(moved, lower[joint], upper[joint])
-    for _ in range(round(0.3 * CONTROL_RATE)):
-        recorder.step(behaviour.patch, force)
-    recorder.rest(0.2)
-    return recorder.episode(index, TASKS[behaviour.name])
-
-
-def grasp_episodes(count: int, seed: int, start_noise: float = 0.05) -> Iterator[Episode]:
-    """Record grasps: touch on one patch reaches, touch on another grasps and retracts.
+    The finger trembles and pushes a random cell. The point is led a little beside the force, by a
+    random angle that stays the same during a push.
 
     Args:
         count: Number of episodes.
-        seed: Seed of forces, pauses, start states and object places.
-        start_noise: Standard deviation of the start state, rad (m: a fifth of it).
+        torso: Push the torso, whose pushes lead the base, instead of the wrist.
+        generator: Draws postures, cells, order, tilt and tremor.
 
     Yields:
         Episodes.
     """
-    env = HSRTouchEnv("grasp")
-    rng = np.random.default_rng(seed)
+    env = HSRTouchEnv("compliance")
+    teacher = YieldTeacher(env)
+    patches = TORSO_PATCHES if torso else WRIST_PATCHES
+    base = [JOINTS.index(joint) for joint in BASE_JOINTS]
     for index in range(count):
-        home = np.array(START_POSES["grasp"])
-        start = noisy_start(home, start_noise, env.joint_lower, env.joint_upper, rng)
-        offset = tuple(rng.uniform(-0.01, 0.01, 2))
-        recorder = _Recorder(env, start, offset)
-        force = GRASP_FORCES[index % len(GRASP_FORCES)]
-        recorder.rest(0.3)
-        _follow(recorder, REACH_PATCH, force, np.vstack([start, REACH_PATH]), rng)
-        recorder.rest(0.5)
-        _follow(recorder, GRASP_PATCH, force, np.vstack([REACH_PATH[-1:], GRASP_PATH]), rng)
-        recorder.rest(0.5)
-        yield recorder.episode(index, TASKS["grasp"])
+        start = random_posture(env.joint_lower, env.joint_upper, generator)
+        start[base] = generator.uniform(-1.0, 1.0, 3) * (BASE_PLACE, BASE_PLACE, np.pi)
+        recorder = _Recorder(teacher, start)
+        recorder.steps(0.1)
+        for patch in generator.permutation(patches).tolist():
+            _push(recorder, teacher, patch, generator)
+            recorder.steps(PUSH_GAP)
+        yield recorder.episode(index, YIELD_TORSO if torso else YIELD_WRIST)
     env.close()
 
 
-def _follow(
-    recorder: _Recorder, patch: str, force: float, path: Array, rng: np.random.Generator
+def _push(
+    recorder: _Recorder, teacher: YieldTeacher, patch: str, generator: np.random.Generator
 ) -> None:
-    """Lead the robot along a path at a speed proportional to the felt force, with one pause."""
-    span = recorder.env.joint_upper - recorder.env.joint_lower
-    lengths = (np.abs(np.diff(path, axis=0)) / span).max(axis=1)
-    mileage = np.concatenate([[0.0], np.cumsum(lengths)])
-    pause_at = rng.uniform(0.2, 0.8) * mileage[-1]
-    travelled = 0.0
-    while travelled < mileage[-1]:
-        felt = recorder.step(patch, force)
-        travelled = min(travelled + GRASP_SPEED * felt / CONTROL_RATE, mileage[-1])
-        recorder.target = np.array([np.interp(travelled, mileage, column) for column in path.T])
-        if travelled > pause_at:
-            recorder.rest(0.4)
-            pause_at = np.inf
-    for _ in range(round(0.3 * CONTROL_RATE)):
-        recorder.step(patch, force)
+    """One trembling push of a random cell, led beside the force."""
+    env = teacher.env
+    cells = env.skin.slices[patch]
+    cell = int(generator.integers(cells.stop - cells.start))
+    normal = env.data.body(env.skin.link[patch]).xmat.reshape(3, 3) @ (
+        env.skin.normals[cells][cell].numpy()
+    )
+    axis = np.cross(normal, generator.standard_normal(3))
+    quaternion, matrix = np.zeros(4), np.zeros(9)
+    mujoco.mju_axisAngle2Quat(
+        quaternion, axis / np.linalg.norm(axis), PUSH_TILT * generator.standard_normal()
+    )
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    teacher.tilt = matrix.reshape(3, 3)
+    rate, phase = generator.uniform(*TREMOR_RATE), generator.uniform(0.0, 2.0 * np.pi)
+    for time in np.arange(round(PUSH_SECONDS * CONTROL_RATE)) / CONTROL_RATE:
+        tremor = TREMOR * float(np.sin(2.0 * np.pi * rate * time + phase))
+        recorder.step(patch, TEACHING_FORCE * (1.0 + tremor), cell)
+
+
+def compliance_episodes(
+    generator: np.random.Generator, repeats: int = COMPLIANCE_EPISODES
+) -> Iterator[Episode]:
+    """Record each one-joint behaviour over the whole range of its joint.
+
+    Args:
+        generator: Draws the postures of the other joints.
+        repeats: Episodes of each behaviour.
+
+    Yields:
+        Episodes, behaviour by behaviour.
+    """
+    env = HSRTouchEnv("compliance")
+    teacher = ComplianceTeacher(env)
+    for number, behaviour in enumerate(BEHAVIOURS):
+        for index in range(repeats):
+            start = upright_posture(env.joint_lower, env.joint_upper, generator)
+            # The arm's flexion, where it is not what yields: each episode in its part of the range.
+            part = (index + generator.uniform()) / repeats
+            start[FLEX] = (1.0 - part) * env.joint_lower[FLEX] + part * env.joint_upper[FLEX]
+            yield _compliance_episode(teacher, behaviour, start, number * repeats + index)
+    env.close()
+
+
+def _compliance_episode(
+    teacher: ComplianceTeacher, behaviour: Behaviour, start: Array, index: int
+) -> Episode:
+    joint = JOINTS.index(behaviour.joint)
+    ends = teacher.env.joint_lower[joint], teacher.env.joint_upper[joint]
+    begin, end = ends if behaviour.direction > 0 else ends[::-1]
+    for straight in ("arm_roll_joint", "wrist_roll_joint"):  # so that the arm moves with the force
+        start[JOINTS.index(straight)] = 0.0
+    start[joint] = begin
+    recorder = _Recorder(teacher, start)
+    recorder.steps(0.2)
+    while teacher.target is not None and teacher.target[joint] != end:
+        recorder.step(behaviour.patch, TEACHING_FORCE)
+    recorder.steps(0.3, behaviour.patch, TEACHING_FORCE)
+    recorder.steps(0.2)
+    return recorder.episode(index, behaviour.task)
+
+
+def grasp_episodes(
+    generator: np.random.Generator, places: Sequence[tuple[float, float]] = OBJECT_PLACES
+) -> Iterator[Episode]:
+    """Record grasps: touch on one patch reaches, touch on another grasps and retracts.
+
+    Args:
+        generator: Draws start states and pauses.
+        places: Displacement of the object in x and y for each episode, m.
+
+    Yields:
+        Episodes, with the object's place among the observations.
+    """
+    env = HSRTouchEnv("grasp")
+    teacher = GraspTeacher(env)
+    home = np.array(START_POSES["grasp"])
+    for index, place in enumerate(places):
+        start = noisy_start(home, START_NOISE, env.joint_lower, env.joint_upper, generator)
+        recorder = _Recorder(teacher, start, place)
+        recorder.steps(0.3)
+        for patch in (REACH_PATCH, GRASP_PATCH):
+            pause_at = generator.uniform(0.2, 0.8)
+            while teacher.progress(patch) < 1.0:
+                recorder.step(patch, TEACHING_FORCE)
+                if teacher.progress(patch) > pause_at:
+                    recorder.steps(GRASP_PAUSE)
+                    pause_at = np.inf
+            recorder.steps(0.3, patch, TEACHING_FORCE)
+            recorder.steps(0.5)
+        yield recorder.episode(index, GRASP)
+    env.close()

@@ -6,7 +6,7 @@
 One step is a control tick of 20 ms, in which the physics takes ten steps.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
@@ -15,9 +15,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from hasm_torch.robot import JOINTS, Skin
-from hasm_torch.sim.finger import Hand
-from hasm_torch.sim.poses import START_POSES
+from hasm_torch.robot import BASE_FRAME, JOINTS, Skin
+from hasm_torch.sim.finger import Hand, TouchPoint
 from hasm_torch.sim.render import SceneRenderer
 from hasm_torch.sim.scene import (
     OBJECT_HALF_SIZE,
@@ -28,7 +27,8 @@ from hasm_torch.sim.scene import (
     joint_speed_limits,
 )
 from hasm_torch.sim.skin_sensor import SkinSensor
-from hasm_torch.sim.slew import SlewedReference
+from hasm_torch.sim.slew import hsr_reference
+from hasm_torch.sim.tasks import START_POSES
 
 Array = NDArray[np.float64]
 
@@ -38,15 +38,6 @@ LARGEST_FORCE = 15.0  # N; up to here no push drives a joint beyond its limits
 SKIN_RANGE = 200.0  # N, where a force point saturates
 
 _SUBSTEPS = round(1 / (CONTROL_RATE * TIMESTEP))
-# Under a push a joint gives way by about a milliradian: the reference keeps that much distance
-# from the limits and from the speed limits, so that the measured values keep within them.
-_LIMIT_MARGIN = {"arm_lift_joint": 0.0005}  # m
-_HINGE_LIMIT_MARGIN = 0.002  # rad
-_SPEED_SHARE = 0.95
-_LARGEST_LEAD = 0.03  # rad or m, of the reference over a joint that something blocks
-_ARM_TIME_TO_FULL_SPEED = 0.1  # s
-# The hand starts more gently: a grip lets go with a jerk.
-_TIME_TO_FULL_SPEED = {"hand_motor_joint": 0.25}  # s
 _OBJECT_OFFSET = 0.01  # m, largest random displacement of the object
 _LIFTED = 0.05  # m
 
@@ -54,11 +45,13 @@ _LIFTED = 0.05  # m
 class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
     """An HSR with artificial skin that a human touches with one or two fingers.
 
-    Observation: {"state": (8,) joint positions in the order of `JOINTS`, rad (arm_lift m);
-    "tactile": (cells * 3,) normal forces of all skin cells, N}. Action: (8,) joint targets,
-    clipped to the joint limits. One step is a control tick of 20 ms. The reward is 1 while the
-    object is lifted and held. An episode has no end of its own: `gymnasium.make` truncates it
-    after `MAX_EPISODE_STEPS`.
+    Observation: {"state": (11,) joint positions in the order of `JOINTS`, rad, m for `METRES`;
+    "tactile": (cells * 3,) normal forces of all skin cells, N; in "grasp" also
+    "environment_state": (3,) centre of the object in the live frame `BASE_FRAME`, m}. Action:
+    (11,) joint targets, clipped to the joint limits; the mobile base has none. The world is the
+    frame `odom` of the base's joints. One step is a control tick of 20 ms. The reward is 1 while
+    the object is lifted and held. An episode has no end of its own: `gymnasium.make` truncates
+    it after `MAX_EPISODE_STEPS`.
 
     `info` holds "is_success" (the object is lifted and held; always False in "compliance"),
     "object_height" (m above the table, 0 without an object), "finger_force" (N, that the skin
@@ -75,11 +68,7 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         "render_fps": CONTROL_RATE,
     }
 
-    def __init__(
-        self,
-        scene: str = "compliance",
-        render_mode: str | None = None,
-    ) -> None:
+    def __init__(self, scene: str = "compliance", render_mode: str | None = None) -> None:
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}")
@@ -90,18 +79,15 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         joints = [self.model.joint(name) for name in JOINTS]
         self._qpos = np.array([joint.qposadr[0] for joint in joints])
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
-        self.joint_lower, self.joint_upper = np.array([joint.range for joint in joints]).T
+        limited = self.model.jnt_limited[[joint.id for joint in joints]] > 0
+        lower, upper = np.array([joint.range for joint in joints]).T
+        self.joint_lower = np.where(limited, lower, -np.inf)
+        self.joint_upper = np.where(limited, upper, np.inf)
         self.joint_speed_limit = joint_speed_limits()
-        margin = np.array([_LIMIT_MARGIN.get(name, _HINGE_LIMIT_MARGIN) for name in JOINTS])
-        speed = _SPEED_SHARE * self.joint_speed_limit
-        times = np.array(
-            [_TIME_TO_FULL_SPEED.get(name, _ARM_TIME_TO_FULL_SPEED) for name in JOINTS]
-        )
-        self._reference = SlewedReference(
-            self.joint_lower + margin,
-            self.joint_upper - margin,
-            speed,
-            speed / times,
+        self._reference = hsr_reference(
+            self.joint_lower,
+            self.joint_upper,
+            self.joint_speed_limit,
             1 / CONTROL_RATE,
             _SUBSTEPS,
         )
@@ -109,33 +95,32 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         self._sensor = SkinSensor(self.model, self.skin)
         self._renderer: SceneRenderer | None = None
         self.skin_forces: Array = np.zeros((self.skin.cells, 3))
+        self._touch_points: list[TouchPoint] = []
         self._steps = 0
 
-        self.observation_space: spaces.Space[Any] = spaces.Dict(
-            {
-                "state": spaces.Box(
-                    self.joint_lower.astype(np.float32), self.joint_upper.astype(np.float32)
-                ),
-                "tactile": spaces.Box(0.0, SKIN_RANGE, (self.skin.cells * 3,), np.float32),
-            }
-        )
-        self.action_space = spaces.Box(
-            self.joint_lower.astype(np.float32), self.joint_upper.astype(np.float32)
-        )
+        limits = self.joint_lower.astype(np.float32), self.joint_upper.astype(np.float32)
+        observed: dict[str, spaces.Space[Any]] = {
+            "state": spaces.Box(*limits),
+            "tactile": spaces.Box(0.0, SKIN_RANGE, (self.skin.cells * 3,), np.float32),
+        }
+        if scene == "grasp":
+            observed["environment_state"] = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        self.observation_space: spaces.Space[Any] = spaces.Dict(observed)
+        self.action_space = spaces.Box(*limits)
 
     @property
     def joint_position(self) -> Array:
-        """Measured positions of `JOINTS`, (8,), rad or m."""
+        """Measured positions of `JOINTS`, (11,), rad or m."""
         return self.data.qpos[self._qpos].copy()
 
     @property
     def joint_velocity(self) -> Array:
-        """Measured velocities of `JOINTS`, (8,), rad/s or m/s."""
+        """Measured velocities of `JOINTS`, (11,), rad/s or m/s."""
         return self.data.qvel[self._dofs].copy()
 
     @property
     def object_position(self) -> Array | None:
-        """Centre of the object, (3,), m; None in a scene without one."""
+        """Centre of the object in `odom`, (3,), m; None in a scene without one."""
         return self.data.body("object").xpos.copy() if self.scene == "grasp" else None
 
     def touch(self, patch: str | None, force: float = 0.0, cell: int | None = None) -> None:
@@ -151,18 +136,39 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         """
         self._hand.touch({} if patch is None else {patch: (force, cell)})
 
-    def touch_all(self, forces: Mapping[str, float]) -> None:
-        """Sets what both fingers do from the next step on, each at the centre of a patch.
+    def touch_all(self, touches: Mapping[str, float | tuple[float, int | None]]) -> None:
+        """Sets what both fingers do from the next step on.
 
         Args:
-            forces: Force on each patch touched, N, 0 to 15; one finger lets go of a patch with 0
-                and of one that is not named.
+            touches: Force on each patch touched, N, 0 to 15, at its centre, or force and cell; one
+                finger lets go of a patch with 0 and of one that is not named.
 
         Raises:
-            ValueError: More than two patches are given, one does not exist, or a force is out of
-                range.
+            ValueError: More than two patches are given, a patch or a cell does not exist, or a
+                force is out of range.
         """
-        self._hand.touch({patch: (force, None) for patch, force in forces.items()})
+        pairs = {p: t if isinstance(t, tuple) else (t, None) for p, t in touches.items()}
+        self._hand.touch(pairs)
+
+    def touch_points(self) -> list[TouchPoint]:
+        """What each finger that pushes did in the last step; empty after a reset."""
+        return self._touch_points
+
+    def block(self, joints: Sequence[str]) -> None:
+        """Holds joints where they are, whatever the action says, until called without them.
+
+        A moving joint first brakes, within 0.1 s (hand and base 0.25 s) from its full speed.
+
+        Args:
+            joints: Names of all joints that are held from now on; [] lets all go, as does a reset.
+
+        Raises:
+            ValueError: A joint does not exist.
+        """
+        unknown = sorted(set(joints) - set(JOINTS))
+        if unknown:
+            raise ValueError(f"joints to block must be of {JOINTS}, got {unknown}")
+        self._reference.hold(np.array([name in joints for name in JOINTS]))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -171,7 +177,7 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
 
         Args:
             seed: Seed of the object's random displacement (up to 1 cm along x and y).
-            options: {"joints": (8,) start, "object": (x, y) displacement of the object, m}.
+            options: {"joints": (11,) start, "object": (x, y) displacement of the object, m}.
 
         Raises:
             ValueError: An option is unknown, has another shape or is not finite.
@@ -195,7 +201,7 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         self.touch(None)
         self._hand.prepare(self.data)
         mujoco.mj_forward(self.model, self.data)
-        self._steps = 0
+        self._steps, self._touch_points = 0, []
         self.skin_forces = self._sensor.read(self.data)
         return self._observation(), self._info()
 
@@ -205,13 +211,13 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         """Runs one control tick.
 
         Args:
-            action: (8,) joint targets in the order of `JOINTS`, rad (arm_lift m).
+            action: (11,) joint targets in the order of `JOINTS`, rad, m for `METRES`.
 
         Raises:
             ValueError: The action has another shape or is not finite.
         """
         target = _vector(action, len(JOINTS), "action")
-        self._reference.stay_near(self.joint_position, _LARGEST_LEAD)
+        self._reference.stay_near(self.joint_position)
         references = self._reference.plan(target)
         model, data, hand = self.model, self.data, self._hand
         pushing = hand.prepare(data)
@@ -227,20 +233,25 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
         self.skin_forces = self._sensor.read(data)
         # Positions of bodies belong to the start of the last physics step: bring them up to date.
         mujoco.mj_kinematics(model, data)
+        self._touch_points = hand.points(self._sensor.pushes)
         info = self._info()
         return self._observation(), float(info["is_success"]), False, False, info
 
-    def render(self) -> NDArray[np.uint8] | None:
+    def render(self, camera: str = "follow") -> NDArray[np.uint8] | None:
         """Image of the scene, (480, 640, 3) uint8; None without a render mode.
+
+        Args:
+            camera: "follow", "top" or "side", see `SceneRenderer`.
 
         Raises:
             RuntimeError: No OpenGL is available.
+            ValueError: The camera is not known.
         """
         if self.render_mode is None:
             return None
         if self._renderer is None:
             self._renderer = SceneRenderer(self.model, self.skin, self.scene)
-        return self._renderer.render(self.data, self.skin_forces, self._hand.touching)
+        return self._renderer.render(self.data, self.skin_forces, self._hand.touching, camera)
 
     def close(self) -> None:
         """Frees the renderer."""
@@ -260,7 +271,13 @@ class HSRTouchEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[np.float32]]):
     def _observation(self) -> dict[str, NDArray[np.float32]]:
         state = self.joint_position.astype(np.float32)
         tactile = np.minimum(self.skin_forces.ravel(), SKIN_RANGE).astype(np.float32)
-        return {"state": state, "tactile": tactile}
+        observation = {"state": state, "tactile": tactile}
+        position = self.object_position
+        if position is not None:
+            base = self.data.body(BASE_FRAME)
+            turned = (position - base.xpos) @ base.xmat.reshape(3, 3)
+            observation["environment_state"] = turned.astype(np.float32)
+        return observation
 
     def _info(self) -> dict[str, Any]:
         height, held = self._object_state()

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from hasm_torch.kernels.compiling import compile_kernel
 from hasm_torch.robot import Skin
 from hasm_torch.sim.scene import FINGER_MASS, FINGER_RADIUS, FINGERS, TIMESTEP
 
@@ -17,8 +18,9 @@ Array = NDArray[np.float64]
 
 _START_GAP = 0.003  # m, between fingertip and skin when a touch begins
 _APPROACH_SPEED = 0.15  # m/s, relative to the skin
-_APPROACH_TIME = 0.004  # s, in which the approach speed is reached
-_LATERAL_FREQUENCY = 60.0  # rad/s, of the critically damped spring along the surface
+_APPROACH_DAMPER = FINGER_MASS / 0.004  # N s/m: the approach speed is reached in 4 ms
+# N/m and N s/m along the surface: critically damped, 60 rad/s
+_LATERAL_SPRING, _LATERAL_DAMPER = FINGER_MASS * 60.0**2, 2 * FINGER_MASS * 60.0
 _AWAY = (0.0, 0.0, -5.0)  # m
 
 
@@ -30,12 +32,80 @@ class Push(NamedTuple):
         point: (3,) point of the skin to stay over, in that body's frame, m.
         normal: (3,) outward unit normal, in that body's frame.
         force: Push against the normal, N; 0 lets go.
+        cell: Cell of the patch under the point; None: the point is the patch's centre.
     """
 
     link: int
     point: Array
     normal: Array
     force: float
+    cell: int | None
+
+
+class TouchPoint(NamedTuple):
+    """What one finger does to the skin; positions and directions in `odom`.
+
+    Attributes:
+        patch: Skin patch that it pushes.
+        cell: Cell of the patch, or None: the patch's centre.
+        force: (3,) what it really applies to the skin, N: the sum of its contacts' normal forces,
+            zeros before contact.
+        point: (3,) where the pushed point of the skin is, m: always the same one of its link.
+    """
+
+    patch: str
+    cell: int | None
+    force: Array
+    point: Array
+
+
+def _push_loop(
+    origin: Array,
+    rotation: Array,
+    point: Array,
+    normal: Array,
+    force: float,
+    position: Array,
+    velocity: Array,
+    previous: Array,
+    applied: Array,
+) -> None:
+    """Force on a finger for one physics step: a push, and a spring that keeps it over its point.
+
+    Args:
+        origin: (3,) where the link is, m.
+        rotation: (3, 3) how it is turned.
+        point: (3,) the skin's point in the link, m.
+        normal: (3,) outward unit normal there.
+        force: Push, N.
+        position: (3,) centre of the finger, m.
+        velocity: (3,) its velocity, m/s.
+        previous: (3,) where the skin's point was one step ago; replaced by where it is now.
+        applied: (3,) replaced by the force, N.
+    """
+    outward, error, slip = np.zeros(3), np.zeros(3), np.zeros(3)
+    height, speed = 0.0, 0.0
+    for i in range(3):
+        target = origin[i]
+        for j in range(3):
+            target += rotation[i, j] * point[j]
+            outward[i] += rotation[i, j] * normal[j]
+        error[i] = position[i] - target
+        slip[i] = velocity[i] - (target - previous[i]) / TIMESTEP
+        previous[i] = target
+        height += error[i] * outward[i]
+        speed += slip[i] * outward[i]
+    along = -force
+    if height > FINGER_RADIUS:
+        along = -_APPROACH_DAMPER * (_APPROACH_SPEED + speed)
+    # The spring and damper act along the surface alone: their normal part is taken out.
+    along += _LATERAL_SPRING * height + _LATERAL_DAMPER * speed
+    for i in range(3):
+        lateral = _LATERAL_SPRING * error[i] + _LATERAL_DAMPER * slip[i]
+        applied[i] = along * outward[i] - lateral
+
+
+_push = compile_kernel(_push_loop)  # ten times a control tick: interpreted it takes a third of it
 
 
 class Finger:
@@ -47,6 +117,7 @@ class Finger:
 
     Attributes:
         body: The sphere's body.
+        cell: Cell of the patch that it pushes; None: the centre.
 
     Args:
         model: Model with the finger's body on three slides.
@@ -58,10 +129,8 @@ class Finger:
         slide = model.joint(f"{name}/x")
         self._position = slice(int(slide.qposadr[0]), int(slide.qposadr[0]) + 3)
         self._velocity = slice(int(slide.dofadr[0]), int(slide.dofadr[0]) + 3)
-        self._lateral_spring = FINGER_MASS * _LATERAL_FREQUENCY**2
-        self._lateral_damper = 2 * FINGER_MASS * _LATERAL_FREQUENCY
-        self._approach_damper = FINGER_MASS / _APPROACH_TIME
         self._force = 0.0
+        self.cell: int | None = None
         self._link = 0
         self._point: Array = np.zeros(3)
         self._normal: Array = np.zeros(3)
@@ -76,7 +145,7 @@ class Finger:
         """
         same = np.array_equal(push.point, self._point)
         self._placed = self._placed and push.force > 0.0 and same
-        self._link, self._point, self._normal, self._force = push
+        self._link, self._point, self._normal, self._force, self.cell = push
 
     def let_go(self) -> None:
         """Ends the touch with the next call of `prepare`."""
@@ -95,7 +164,7 @@ class Finger:
         if self._force == 0.0:
             self._at[:], self._moving[:] = _AWAY, 0.0
         elif not self._placed:
-            target, normal = self._aim()
+            target, normal = self.aim()
             velocity = self._point_velocity(data, target)
             self._at[:] = target + normal * (FINGER_RADIUS + _START_GAP)
             self._moving[:] = velocity
@@ -105,23 +174,23 @@ class Finger:
 
     def push(self) -> None:
         """Sets the finger's force for one physics step, from up-to-date positions."""
-        target, normal = self._aim()
-        error = self._at - target
-        slip = self._moving - (target - self._previous) / TIMESTEP
-        self._previous = target
-        height, speed = float(error @ normal), float(slip @ normal)
-        if height > FINGER_RADIUS:
-            along = -self._approach_damper * (_APPROACH_SPEED + speed)
-        else:
-            along = -self._force
-        # The spring and damper act along the surface alone: their normal part is taken out.
-        along += self._lateral_spring * height + self._lateral_damper * speed
-        self._applied[:] = (
-            along * normal - self._lateral_spring * error - self._lateral_damper * slip
+        _push(
+            self._origin,
+            self._rotation,
+            self._point,
+            self._normal,
+            self._force,
+            self._at,
+            self._moving,
+            self._previous,
+            self._applied,
         )
 
-    def _aim(self) -> tuple[Array, Array]:
-        """Where the skin's point is and where its normal points, in the world."""
+    def aim(self) -> tuple[Array, Array]:
+        """Where the skin's point is and where its normal points, (3,) each, in the world.
+
+        Valid from the touch's first `prepare` on.
+        """
         return self._origin + self._rotation @ self._point, self._rotation @ self._normal
 
     def _point_velocity(self, data: mujoco.MjData, point: Array) -> Array:
@@ -187,6 +256,18 @@ class Hand:
         for finger in self._pushing:
             finger.push()
 
+    def points(self, pushes: Mapping[int, Array]) -> list[TouchPoint]:
+        """What each finger that pushes does.
+
+        Args:
+            pushes: Force of every body that touches the skin onto it, (3,), N.
+        """
+        return [
+            TouchPoint(patch, finger.cell, pushes.get(finger.body, np.zeros(3)), finger.aim()[0])
+            for patch, finger in self.touching.items()
+            if finger in self._pushing
+        ]
+
     def _push(self, patch: str, force: float, cell: int | None) -> Push:
         if patch not in self._links:
             raise ValueError(
@@ -199,4 +280,4 @@ class Hand:
         if cell is not None and not 0 <= cell < len(points):
             raise ValueError(f"cell of {patch} must be 0 to {len(points) - 1}, got {cell}")
         point = points.mean(0) if cell is None else points[cell]
-        return Push(self._links[patch], point, self._normals[span][0], float(force))
+        return Push(self._links[patch], point, self._normals[span][0], float(force), cell)

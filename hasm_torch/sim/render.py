@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from hasm_torch.robot import Skin
+from hasm_torch.robot import BASE_FRAME, Skin
 from hasm_torch.sim.finger import Finger
 from hasm_torch.sim.scene import FINGER_RADIUS
 
@@ -25,19 +25,30 @@ _SLEEVE_COLOUR = np.array([0.25, 0.35, 0.6, 1.0])
 _CELL_COLOURS = np.array(
     [[0.13, 0.3, 0.24], [0.95, 0.85, 0.1], [1.0, 0.45, 0.05], [0.95, 0.1, 0.05]]
 )
-_CAMERAS = {
+# Of the camera that follows: what it looks at, distance, azimuth and elevation.
+_FOLLOWING = {
     "compliance": ((0.26, 0.0, 0.72), 1.3, 126.0, -16.0),
     "grasp": ((0.36, 0.0, 0.74), 1.3, 126.0, -18.0),
 }
+# It goes along with the base by this share of its way and stands back by the rest: what the base
+# leaves behind stays in the picture.
+_ALONG = 0.6
+# Azimuth and elevation of the cameras that stand still and see in parallel.
+_PARALLEL = {"top": (90.0, -90.0), "side": (90.0, 0.0)}
+EXTENTS = {"top": (-0.9, 1.5, -0.9, 0.9), "side": (-0.9, 1.5, -0.1, 1.7)}
+"""Left, right, bottom and top of these two pictures in `odom`, m: x and y, and x and z."""
 
 
 class SceneRenderer:
-    """Draws a simulation from a fixed camera, without shadows.
+    """Draws a simulation, without shadows.
+
+    Camera "follow" goes along with the mobile base; "top" and "side" stand still and show the
+    section `EXTENTS` of the world to scale.
 
     Args:
         model: Model of the scene.
         skin: Geometry of the cells.
-        scene: "compliance" or "grasp": where the camera stands.
+        scene: "compliance" or "grasp": where the camera that follows starts.
 
     Raises:
         RuntimeError: No OpenGL context can be made.
@@ -62,10 +73,9 @@ class SceneRenderer:
             )
             raise RuntimeError(SceneRenderer._failure) from error
         self._scene_options = mujoco.MjvOption()
-        self._camera = mujoco.MjvCamera()
-        view = _CAMERAS[scene]
-        self._camera.lookat[:] = view[0]
-        self._camera.distance, self._camera.azimuth, self._camera.elevation = view[1:]
+        self._visual = model.vis.global_
+        self._scene, self._base = scene, model.body(BASE_FRAME).id
+        self._angle = float(self._visual.fovy)
         self._hexagon = model.mesh("cell").id
         # The compiler turns a mesh onto its principal axes; drawing turns it back.
         turned_back = np.zeros(9)
@@ -81,7 +91,11 @@ class SceneRenderer:
             self._centres[name] = (body, positions[span].mean(0), normals[span][0])
 
     def render(
-        self, data: mujoco.MjData, forces: Array, touching: Mapping[str, Finger]
+        self,
+        data: mujoco.MjData,
+        forces: Array,
+        touching: Mapping[str, Finger],
+        camera: str,
     ) -> NDArray[np.uint8]:
         """Draws the scene.
 
@@ -89,11 +103,16 @@ class SceneRenderer:
             data: Simulation, with up-to-date kinematics.
             forces: (cells, 3) skin forces, N.
             touching: Patches with a finger at them.
+            camera: "follow", "top" or "side".
 
         Returns:
             (480, 640, 3) image.
+
+        Raises:
+            ValueError: The camera is not known.
         """
-        self._renderer.update_scene(data, self._camera, self._scene_options)
+        view = self._view(camera, data.xpos[self._base])
+        self._renderer.update_scene(data, view, self._scene_options)
         scene = self._renderer.scene
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         colours = _colours(forces.sum(1))
@@ -111,6 +130,29 @@ class SceneRenderer:
     def close(self) -> None:
         """Frees the OpenGL context."""
         self._renderer.close()
+
+    def _view(self, camera: str, base: Array) -> mujoco.MjvCamera:
+        """A camera, for the place of the base, (3,), m."""
+        view = mujoco.MjvCamera()
+        if camera == "follow":
+            middle, distance, view.azimuth, view.elevation = _FOLLOWING[self._scene]
+            view.lookat[:] = middle + _ALONG * base
+            view.distance = distance + (1 - _ALONG) * float(np.linalg.norm(base))
+            self._visual.fovy = self._angle
+        elif camera in _PARALLEL:
+            left, right, bottom, top = EXTENTS[camera]
+            across = (bottom + top) / 2
+            view.lookat[:] = (
+                (left + right) / 2,
+                *((across, 1.0) if camera == "top" else (0, across)),
+            )
+            view.azimuth, view.elevation = _PARALLEL[camera]
+            view.distance, view.orthographic = 4.0, 1
+            # What is an angle in perspective is the height of the picture here, m.
+            self._visual.fovy = top - bottom
+        else:
+            raise ValueError(f"camera must be 'follow', 'top' or 'side', got {camera!r}")
+        return view
 
     def _draw_finger(
         self, data: mujoco.MjData, scene: mujoco.MjvScene, patch: str, finger: Finger

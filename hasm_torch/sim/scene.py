@@ -49,7 +49,7 @@ OBJECT_POSITION = (0.677, 0.078)  # m, where the scripted grasp expects it
 
 
 def joint_speed_limits() -> Array:
-    """Speed limits of `JOINTS` in the URDF, (8,), rad/s or m/s.
+    """Speed limits of `JOINTS` in the URDF, (11,), rad/s or m/s.
 
     A joint that another one follows is slowed down to what the follower can do.
     """
@@ -70,7 +70,8 @@ def build_model(scene: str, skin: Skin) -> mujoco.MjModel:
         skin: Patches to put on the robot.
 
     Returns:
-        Model with one position actuator for each of the HSR's `JOINTS`, in that order; skin
+        Model with one position actuator for each of the HSR's `JOINTS`, the mobile base's too, in
+        that order: the wheels' friction on the floor is left to the base's drives; skin
         geoms named "skin/<patch>"; the bodies `FINGERS` on three slides each; in "grasp" a
         free body "object".
 
@@ -157,7 +158,10 @@ def _add_drives(spec: mujoco.MjSpec) -> None:
 
 
 def _largest_inertia(spec: mujoco.MjSpec) -> dict[str, float]:
-    """The largest inertia each joint moves over 64 postures, its mimic followers included."""
+    """The largest inertia each joint moves over 64 postures, its mimic followers included.
+
+    The base, which has no range, stays at 0: where it stands changes no inertia.
+    """
     model = spec.copy().compile()
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
@@ -234,11 +238,11 @@ def _add_room(spec: mujoco.MjSpec) -> None:
         width=128,
         height=128,
     )
-    spec.add_material(name="floor", textures=["", "floor"], texrepeat=[8, 8])
+    spec.add_material(name="floor", textures=["", "floor"], texrepeat=[20, 20])
     spec.worldbody.add_geom(
         name="floor",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[2, 2, 0.1],
+        size=[5, 5, 0.1],
         material="floor",
         contype=_SUPPORT,
         conaffinity=0,
@@ -246,6 +250,7 @@ def _add_room(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_light(pos=[1.0, -1.5, 2.5], dir=[-0.4, 0.6, -1.0], castshadow=False)
     spec.visual.headlight.ambient = [0.45, 0.45, 0.45]
     spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
+    spec.visual.headlight.specular = [0.0, 0.0, 0.0]
 
 
 def _add_table_and_object(spec: mujoco.MjSpec) -> None:

@@ -32,6 +32,10 @@ def spread(force: float, position: Array, points: Array, width: float = FOOTPRIN
 class SkinSensor:
     """Reads the forces of all skin cells from a simulation.
 
+    Attributes:
+        pushes: Force of every body that touches the skin onto it at the last reading, (3,), N, in
+            the world's frame: the sum of its contact normal forces.
+
     Args:
         model: Model whose geoms "skin/<patch>" are the patches.
         skin: Geometry of the cells.
@@ -49,6 +53,7 @@ class SkinSensor:
             self._points.append(points[skin.slices[name]])
             self._bodies.append(model.body(skin.link[name]).id)
         self._wrench = np.zeros(6)
+        self.pushes: dict[int, Array] = {}
 
     def read(self, data: mujoco.MjData) -> Array:
         """Normal forces at the three points of every cell, (cells, 3), N.
@@ -56,9 +61,12 @@ class SkinSensor:
         Their sum is the sum of the contact normal forces on the skin.
         """
         forces = np.zeros((self._cells, 3))
+        self.pushes = {}
         if data.ncon == 0:
             return forces
-        patches = self._geom_patch[data.contact.geom].max(1)
+        geoms = data.contact.geom
+        sides = self._geom_patch[geoms]
+        patches = sides.max(1)
         for contact in np.flatnonzero(patches >= 0):
             patch = patches[contact]
             body = self._bodies[patch]
@@ -66,4 +74,9 @@ class SkinSensor:
             offset = data.contact.pos[contact] - data.xpos[body]
             local = offset @ data.xmat[body].reshape(3, 3)
             forces[self._slices[patch]] += spread(self._wrench[0], local, self._points[patch])
+            # A contact's normal points from its first geom to its second.
+            second = int(sides[contact, 1] == patch)
+            push = self._wrench[0] * (2 * second - 1) * data.contact.frame[contact, :3]
+            toucher = int(self._model.geom_bodyid[geoms[contact, 1 - second]])
+            self.pushes[toucher] = self.pushes.get(toucher, 0.0) + push
         return forces

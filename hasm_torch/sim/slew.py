@@ -8,7 +8,38 @@ Measured positions and speeds keep within the limits because the reference does.
 import numpy as np
 from numpy.typing import NDArray
 
+from hasm_torch.robot import JOINTS, METRES
+
 Array = NDArray[np.float64]
+
+# Under a push a joint gives way by about a milliradian: the reference keeps that much distance
+# from the limits and from the speed limits, so that the measured values keep within them.
+_LIMIT_MARGIN = np.where(np.isin(JOINTS, METRES), 0.0005, 0.002)  # m or rad
+_SPEED_SHARE = 0.95
+_LARGEST_LEAD = 0.03  # rad or m, of the reference over a joint that something blocks
+_ARM_TIME_TO_FULL_SPEED = 0.1  # s
+# The hand starts more gently: a grip lets go with a jerk. The base takes 0.95 m/s^2 of the
+# 1.67 m/s^2 that its drive wheels can do (41.7 rad/s^2 at a radius of 0.04 m), and turns with as
+# little: half the wheels' tread of 0.266 m at 4.75 rad/s^2 is 0.63 m/s^2.
+_TIME_TO_FULL_SPEED = {"hand_motor_joint": 0.25, "odom_x": 0.2, "odom_y": 0.2, "odom_t": 0.2}  # s
+
+
+def hsr_reference(
+    lower: Array, upper: Array, velocity: Array, tick: float, substeps: int
+) -> "SlewedReference":
+    """The reference of the HSR's `JOINTS`, with which measured values keep within the limits.
+
+    Args:
+        lower: (J,) lower joint limits, rad or m; minus infinity where there is none.
+        upper: (J,) upper joint limits, rad or m; infinity where there is none.
+        velocity: (J,) speed limits, rad/s or m/s.
+        tick: Length of a control tick, s.
+        substeps: Physics steps a tick.
+    """
+    speed = _SPEED_SHARE * velocity
+    times = np.array([_TIME_TO_FULL_SPEED.get(name, _ARM_TIME_TO_FULL_SPEED) for name in JOINTS])
+    limits = lower + _LIMIT_MARGIN, upper - _LIMIT_MARGIN
+    return SlewedReference(*limits, speed, speed / times, tick, substeps)
 
 
 class SlewedReference:
@@ -39,6 +70,7 @@ class SlewedReference:
         substeps: int,
     ) -> None:
         self.lower, self.upper = lower, upper
+        self._acceleration = acceleration
         self._speed_unit = acceleration * tick
         self._distance_unit = acceleration * tick**2
         self._fastest = velocity / self._speed_unit
@@ -46,21 +78,35 @@ class SlewedReference:
         self._ramp = self._times**2 / (2 * tick)
         self.position = np.zeros_like(lower)
         self.velocity = np.zeros_like(lower)
+        self._held: NDArray[np.bool_] = np.zeros(len(lower), bool)
+        self._place = np.zeros_like(lower)
 
     def reset(self, position: Array) -> None:
-        """Puts the reference at rest at `position`, (J,), moved inside the limits."""
+        """Puts the reference at rest at `position`, (J,), moved inside the limits; holds none."""
         self.position = np.clip(position, self.lower, self.upper)
         self.velocity = np.zeros_like(self.position)
+        self._held = np.zeros(len(self.position), bool)
 
-    def stay_near(self, measured: Array, lead: float) -> None:
-        """Stops the reference of joints that are blocked, so that they later start from rest.
+    def hold(self, joints: NDArray[np.bool_]) -> None:
+        """Brings some joints to rest as soon as their accelerations allow, and keeps them there.
+
+        Args:
+            joints: (J,) whether a joint is held from now on; one that was held stays where it was.
+        """
+        braking = self.velocity * np.abs(self.velocity) / (2 * self._acceleration)
+        caught = joints & ~self._held
+        self._place = np.where(caught, self.position + braking, self._place)
+        self._held = joints
+
+    def stay_near(self, measured: Array) -> None:
+        """Stops the reference of joints that something blocks, so that they later start from rest.
 
         Args:
             measured: (J,) measured joint positions, rad or m.
-            lead: Farthest that a reference may be from them; more than the drives' lag.
         """
-        blocked = np.abs(self.position - measured) > lead
-        near = np.clip(self.position, measured - lead, measured + lead)
+        # More than the drives' lag.
+        blocked = np.abs(self.position - measured) > _LARGEST_LEAD
+        near = np.clip(self.position, measured - _LARGEST_LEAD, measured + _LARGEST_LEAD)
         self.position = np.where(blocked, np.clip(near, self.lower, self.upper), self.position)
         self.velocity = np.where(blocked, 0.0, self.velocity)
 
@@ -68,11 +114,12 @@ class SlewedReference:
         """References of the next tick's physics steps.
 
         Args:
-            target: (J,) joint target, rad or m; moved inside the limits.
+            target: (J,) joint target, rad or m; moved inside the limits, ignored where held.
 
         Returns:
             (substeps, J) references; the last one is the new `position`.
         """
+        target = np.where(self._held, self._place, target)
         speed = self.velocity / self._speed_unit
         error = (np.clip(target, self.lower, self.upper) - self.position) / self._distance_unit
         ahead = error - speed / 2

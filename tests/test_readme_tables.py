@@ -1,0 +1,86 @@
+"""One command writes the tables of all pages, from results that are there."""
+
+import json
+
+import pytest
+
+from benchmarks import readme_tables
+
+PAGE = "before\n<!-- table:{0} -->\nstale\n<!-- /table:{0} -->\nafter\n"
+
+
+def along(share: float) -> dict:
+    return {"share_07_of_teacher": share, "cos_median": 0.9, "against": 0.0,
+            "travel_of_teacher": None}  # fmt: skip
+
+
+@pytest.fixture
+def evaluated() -> dict:
+    figures = ("direction_correct", "spearman", "r2", "tracking", "release_drift_rad")
+    arm, wrist = ({key: value for key in figures} for value in (1.0, 0.5))
+    still = {"release_drift_rad": 0.001, "limit_violations": 0}
+    episodes = {"10": along(0.7), "40": along(0.8), "80": along(0.95)}
+    return {
+        "compliance": {
+            "behaviours": {"arm_up": arm | {"with_force": 1.0},
+                           "wrist_left": wrist | {"correct_turn": 0.25}},
+            "limit_violations": 0,
+        },
+        "yield": {
+            "along_force": along(0.95),
+            "episodes": episodes,
+            "speed": {"spearman": 0.9, "spearman_of_teacher": 0.9},
+            "torso": {"base_cos_09": 1.0, "limit_violations": 2} | still,
+            "unseen_patch": along(0.8),
+        } | still,
+        "grasp": {"success_rate": 1.0, "hold_drift_rad": 0.0, "limit_violations": 1,
+                  "moved": {"0.02": 1.0, "0.05": 0.9, "0.10": 0.8}},
+        "train_seconds": 1.5, "memory_bytes": 1234567, "tick_ms": {"median": 0.3, "p99": 1.0},
+    }  # fmt: skip
+
+
+def folder(path, results: dict, **pages: str):
+    (path / "docs").mkdir()
+    (path / "results").mkdir()
+    for name, content in results.items():
+        (path / "results" / f"{name}.json").write_text(json.dumps(content))
+    (path / "README.md").write_text(pages.pop("readme", ""))
+    for name, text in pages.items():
+        (path / "docs" / f"{name}.md").write_text(text)
+    return path / "results", path
+
+
+def test_tables_of_all_pages_are_written(tmp_path, evaluated):
+    part = {"seconds_ahead": 0.5, "hasm": 0.41, "ridge": 0.6, "neighbours": None}
+    report = {"one_step": part | {"seconds_ahead": 0.02}, "horizon": part}
+    figures = {"share_07_of_teacher": 0.9, "share_07_of_teacher_interval": [0.8, 0.95]}
+    results = {
+        "eval_default": evaluated, "eval_literal": evaluated, "open_loop_icub": report,
+        "yield_controls": {"sizes": {"10": {"argmax": figures}}},
+        "rules": {"variants": {"no tether": figures | {"travel_of_teacher": 1.02}}},
+    }  # fmt: skip
+    both = PAGE.format("default") + PAGE.format("literal")
+    rest = "".join(PAGE.format(name) for name in ("yield", "open_loop", "controls", "rules"))
+    done = readme_tables.write(*folder(tmp_path, results, readme=both, method=rest))
+    assert len(done) == 6
+    readme, method = (tmp_path / "README.md").read_text(), (tmp_path / "docs/method.md").read_text()
+    assert "stale" not in readme + method
+    assert readme.count("before") == readme.count("after") == 2
+    assert "| compliance, the worst: `r2` | ≥ 0.9 | 0.5 | 0.5 |" in readme
+    assert "| compliance, the worst: `correct_turn` | ≥ 1.0 | 0.25 | 0.25 |" in readme
+    assert "| `memory_bytes` | ≤ 1,000,000 | 1,234,567 | 1,234,567 |" in readme
+    assert "| 80 | 0.95 | 0.9 | 0 | none |" in method
+    assert "| iCub | 0.5 s | 0.41 | none | 0.6 |" in method
+    assert "| argmax | 0.90 (0.80 to 0.95) |" in method
+    assert "| no tether | 0.90 (0.80 to 0.95) | 1.02 |" in method
+    again = readme_tables.write(tmp_path / "results", tmp_path)
+    assert again == done
+    assert (tmp_path / "README.md").read_text() == readme
+
+
+def test_a_table_without_results_stays_and_is_told(tmp_path):
+    page = PAGE.format("controls") + PAGE.format("nonsense")
+    told = readme_tables.write(*folder(tmp_path, {}, readme=page))
+    assert (tmp_path / "README.md").read_text() == page
+    assert "yield_controls.json" in told[0]
+    assert "no table 'nonsense'" in told[1]
