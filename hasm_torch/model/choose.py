@@ -225,7 +225,7 @@ def _choose_recall(
     held = HeldOut(config, body, table, values, weight, most, unmoved(body, settled, table))
     readouts = _readouts(config, settled)
     usual = replace(settled, readout=readouts[-1], angle=angle_of(config, readouts[-1]))
-    touches = _touches(config, table)
+    touches = _touches(config)
     if not held.possible:
         joints = _named(config, body) or _differing(body, settled, table)
         beta = _beta(config, joints, SHARP_SOFTNESS)
@@ -300,7 +300,7 @@ def _named(config: HASMConfig, body: Body) -> list[int]:
     return sorted(body.joints.index(name) for name in config.joints or [])
 
 
-def _touches(config: HASMConfig, table: Table) -> list[str]:
+def _touches(config: HASMConfig) -> list[str]:
     return ["direction", "patch"] if config.touch == "auto" else [config.touch]
 
 
