@@ -31,7 +31,7 @@ from torch import Tensor
 from benchmarks.machine import RESULTS, print_machine, save_json
 from hasm_torch import HeteroAssociativeMemory, to_bipolar
 from hasm_torch.apps.command_line import parse_options
-from hasm_torch.memory.interaction import Interaction
+from hasm_torch.memory.recall import Interaction
 
 REFERENCE = Path(__file__).parent.parent / "tests" / "data" / "sequence_capacity.json"
 

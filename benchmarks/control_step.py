@@ -85,7 +85,7 @@ def roll_out(model: HASM, start: torch.Tensor, steps: int) -> tuple[np.ndarray, 
         state = model.step(state, skin, observation=seen)
         computed_after = time.thread_time()
         seconds[:, step] = time.perf_counter() - clock, computed_after - computed
-        recalls[step] = len(model.rollout.queries)
+        recalls[step] = len(model.rollout.asked)
     return seconds, recalls
 
 

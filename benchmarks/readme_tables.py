@@ -8,8 +8,11 @@ is made of lies in benchmarks/results/:
     cp outputs/eval/default/metrics.json benchmarks/results/eval_default.json
     cp outputs/eval/literal/metrics.json benchmarks/results/eval_literal.json
     uv run eval.py --mode=open_loop --dataset.root=FOLDER  # open_loop.json → open_loop_icub.json
+    uv run eval.py --mode=open_loop --dataset.root=OTHER   # open_loop.json → open_loop_g1.json
+    uv run examples/teach_in_two_minutes.py                # → teach_in_two_minutes.json
     uv run benchmarks/yield_controls.py                    # → yield_controls.json
     uv run benchmarks/rules.py                             # → rules.json
+    uv run benchmarks/skin_filter.py                       # → skin_filter.json
     uv run benchmarks/readme_tables.py
 """
 
@@ -32,7 +35,7 @@ from hasm_torch.evaluation.report import (
 
 MARKED = re.compile(r"(<!-- table:(\w+) -->\n)(.*?)(<!-- /table:\2 -->)", re.DOTALL)
 OPEN_LOOP = {"hasm": "memory", "neighbours": "tuned neighbours", "ridge": "ridge on lags"}
-ROBOTS = {"open_loop_icub": "iCub"}
+ROBOTS = {"open_loop_icub": "iCub", "open_loop_g1": "G1"}
 
 Rows = Sequence[Sequence[str]]
 
@@ -126,6 +129,49 @@ def rules(measured: dict[str, Any]) -> str:
     return markdown(("changed", "`share_07_of_teacher`", "`travel_of_teacher`"), rows)
 
 
+def teach(*sessions: dict[str, Any]) -> str:
+    """What sessions of teaching by hand came to, a column each."""
+    rows = [
+        ["pushes shown", *(_shown(found["pushes"]) for found in sessions)],
+        ["lessons", *(_shown(found["lessons"]) for found in sessions)],
+        ["time of teaching", *(f"{found['taught_s']:.0f} s" for found in sessions)],
+        ["time of learning, all lessons", *(f"{found['learned_s']:.2f} s" for found in sessions)],
+        [
+            "unseen pushes with cos > 0.7, of the hand's own",
+            *(f"{found['tested']['share_07_of_teacher']:.0%}" for found in sessions),
+        ],
+        [
+            "weight of a lesson in its own posture, before and after forgetting it",
+            *(
+                f"{found['forgotten']['weight_before']:.2f}, "
+                f"{found['forgotten']['weight_after']:.2f}"
+                for found in sessions
+            ),
+        ],
+        [
+            "a grasp shown once: lifted from other starts",
+            *(f"{found['grasp']['lifted']} of {found['grasp']['starts']}" for found in sessions),
+        ],
+    ]
+    return markdown(("", "lessons of a dozen pushes", "single pushes"), rows)
+
+
+def skin_filter(measured: dict[str, Any]) -> str:
+    """Share, way and compliance with a damaged skin, without and with the filter."""
+
+    def shown(found: dict[str, Any]) -> str:
+        pushed = found["yield"]
+        figures = pushed["share_07_of_teacher"], pushed["travel_of_teacher"]
+        return ", ".join(f"{x:.2f}" for x in (*figures, found["compliance"]["success"]))
+
+    rows = []
+    for fault, found in measured["faults"].items():
+        own = found.get(f"without {fault.split()[0]}")
+        cells = [shown(found["no filter"]), shown(found["whole"]), shown(own) if own else ""]
+        rows.append([fault, *cells])
+    return markdown(("fault", "no filter", "filter", "filter without its rule"), rows)
+
+
 # What each table is made of, in the order of its arguments.
 TABLES: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     "default": (default, ("eval_default",)),
@@ -134,6 +180,8 @@ TABLES: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     "open_loop": (open_loop, tuple(ROBOTS)),
     "controls": (controls, ("yield_controls",)),
     "rules": (rules, ("rules",)),
+    "skin_filter": (skin_filter, ("skin_filter",)),
+    "teach": (teach, ("teach_in_two_minutes", "teach_single_pushes")),
 }
 
 

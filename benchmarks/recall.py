@@ -21,7 +21,7 @@ from torch import Tensor
 
 from benchmarks.machine import print_machine, save_json
 from hasm_torch.apps.command_line import parse_options
-from hasm_torch.memory.recall import recall_packed, unpack
+from hasm_torch.memory.recall import Stored, recall_packed, unpack
 
 VALUES = 8  # joints
 BETA = 1.0
@@ -120,7 +120,7 @@ def run_size(device: str, dim: int, rows: int, quick: bool, rounds: int) -> list
         query = torch.where(flip, -query, query)
 
         contestants: Contestants = {
-            OURS: partial(recall_packed, query, words, successors, beta, count),
+            OURS: partial(recall_packed, query, Stored(words, successors, beta, count)),
             COPY: lambda: target.copy_(words),
         }
         if codes is not None:

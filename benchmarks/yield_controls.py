@@ -98,7 +98,7 @@ def learn(name: str, data: EpisodeSet, directory: Path) -> None:
     model = HASM(CONTESTANTS[name], body_of(data))
     model.fit(data)
     if name == TABLE:
-        save_nearest(model, data.episodes, directory)
+        save_nearest(model, directory)
     else:
         model.save_pretrained(directory)
 

@@ -5,7 +5,7 @@ from hasm_torch.config import HASMConfig
 from hasm_torch.encoders.bipolar import binarise, bind, to_bipolar
 from hasm_torch.encoders.izhikevich import Izhikevich, IzhikevichState
 from hasm_torch.encoders.place_code import PlaceCode
-from hasm_torch.encoders.rope3d import RoPE3D, rope3d, touch_rotation
+from hasm_torch.encoders.rope3d import RoPE3D, rope3d
 from hasm_torch.encoders.touch import EffectiveForce, TactileEmbedding
 from hasm_torch.memory import functional
 from hasm_torch.memory.layer import HeteroAssociativeMemory
@@ -27,5 +27,4 @@ __all__ = [
     "functional",
     "rope3d",
     "to_bipolar",
-    "touch_rotation",
 ]

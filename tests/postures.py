@@ -2,12 +2,14 @@
 
 import numpy as np
 
-from hasm_torch.robot import Kinematics
+from hasm_torch._assets import asset_path
+from hasm_torch.robot import JOINTS
+from hasm_torch.robot.urdf import read_urdf
 
-_HSR = Kinematics()
+_HSR = [read_urdf(asset_path("hsr.urdf")).joints[name] for name in JOINTS]
 # The base has no limits: its joints get a metre and a radian to each side.
-LOWER = np.nan_to_num(_HSR.lower.numpy(), neginf=-1.0)
-UPPER = np.nan_to_num(_HSR.upper.numpy(), posinf=1.0)
+LOWER = np.nan_to_num([joint.lower for joint in _HSR], neginf=-1.0)
+UPPER = np.nan_to_num([joint.upper for joint in _HSR], posinf=1.0)
 
 
 def anywhere(rng, *shape):

@@ -21,7 +21,7 @@ from toys import (
 
 from hasm_torch import HASM, HASMConfig
 from hasm_torch.body import Body
-from hasm_torch.model.choose import soft_weights
+from hasm_torch.model.choose import absence, soft_weights
 from hasm_torch.model.fit import FitReport
 
 BODY = make_body(3)
@@ -268,10 +268,11 @@ def test_the_report_says_what_was_learned_tried_and_chosen():
 
 @pytest.mark.parametrize("softness", [0.0, 4.0, 60.0, math.inf])
 def test_soft_weights_reach_from_the_mean_to_the_argmax(softness):
-    scores = torch.tensor([[0.2, 0.9, 0.5, -math.inf], [0.3, -math.inf, 0.3, 0.1]])
-    weights = soft_weights(scores, softness)
+    scores = torch.tensor([[0.2, 0.9, 0.5, 1.0], [0.3, 0.8, 0.3, 0.1]])
+    excluded = torch.tensor([[False, False, False, True], [False, True, False, False]])
+    weights = soft_weights(scores, absence(excluded), softness)
     torch.testing.assert_close(weights.sum(1), torch.ones(2))
-    assert not weights[scores == -math.inf].any()
+    assert not weights[excluded].any()
     if softness == 0:
         torch.testing.assert_close(weights[0, :3], torch.full((3,), 1 / 3))
     elif softness == math.inf:

@@ -26,16 +26,18 @@ from toys import (
 from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig
 from hasm_torch.model.choose import recalled_values
-from hasm_torch.model.collect import COURSE_POINTS, LEAST_SPIKES, SHORTEST_PHASE, Collected, collect
+from hasm_torch.model.collect import LEAST_SPIKES, SHORTEST_PHASE
 from hasm_torch.model.felt import Touch, calibrate, felt
+from hasm_torch.model.fit import read
+from hasm_torch.model.lessons import COURSE_POINTS, Lessons
 
 BODY = make_body(3)
 CONFIG = HASMConfig()
 RATE = BODY.rate
 
 
-def collected(*episodes, config: HASMConfig = CONFIG, body: Body = BODY) -> Collected:
-    return collect(config, body, settled(body), episodes)
+def collected(*episodes, config: HASMConfig = CONFIG, body: Body = BODY) -> Lessons:
+    return read(config, body, settled(body), episodes)
 
 
 def restless(seed: int, samples: int = 60) -> Recorded:
@@ -128,7 +130,7 @@ def test_the_lag_is_the_largest_distance_of_target_and_joint():
         np.abs(e.action - np.clip(e.state, *limits(BODY))).max(0) for e in map(restless, (4, 5))
     ]
     np.testing.assert_allclose(found.lag, np.max(both, axis=0))
-    assert found.episodes == 2
+    assert len(found) == 2
 
 
 def pressed(*parts: tuple[str | None, int], joint: int = 0, step: float = 0.01) -> Recorded:
@@ -212,7 +214,7 @@ def test_displacements_of_the_base_are_seen_from_the_base(yaw, x):
 def test_streams_and_generators_are_read_alike():
     episodes = [restless(seed, 40) for seed in range(3)]
     whole = collected(*episodes)
-    streamed = collect(CONFIG, BODY, settled(BODY), (restless(seed, 40) for seed in range(3)))
+    streamed = read(CONFIG, BODY, settled(BODY), (restless(seed, 40) for seed in range(3)))
     for name, column in vars(whole.samples).items():
         np.testing.assert_array_equal(column, getattr(streamed.samples, name))
     assert sorted(set(whole.samples.episode)) == [0, 1, 2]
@@ -229,12 +231,12 @@ def test_observations_are_those_where_it_began():
 
 def test_motion_is_led_by_touch_or_by_nothing():
     led = collected(pressed((None, 20), ("front", 30), (None, 20)))
-    assert led.led > 0.8
+    assert led.led() > 0.8
     path = np.vstack([straight(BODY, 0, samples=50), straight(BODY, 0, 0.9, 0.9, 50)])
     skin = np.zeros((100, 6, 3))
     skin[50:] = press(BODY, "front", 6.0).numpy()
     against = Recorded(np.arange(100) / RATE, path, path, skin)  # it moves before it is touched
-    assert collected(against).led < -0.5
+    assert collected(against).led() < -0.5
 
 
 GOOD = record(BODY, "front", straight(BODY, 0), 6.0)

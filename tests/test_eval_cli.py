@@ -6,7 +6,6 @@ import math
 import os
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,7 @@ import pytest
 from hasm_torch import HASM
 from hasm_torch.data.training import train
 from hasm_torch.evaluation.evaluate import evaluate
-from hasm_torch.evaluation.open_loop import OpenLoopConfig
-from hasm_torch.evaluation.options import BOTH, OPEN_LOOP, EvalConfig
+from hasm_torch.evaluation.options import EvalConfig
 from hasm_torch.evaluation.runner import EXPERIMENTS
 
 ROOT = Path(__file__).parents[1]
@@ -222,11 +220,6 @@ def test_what_cannot_be_done_is_refused_with_a_message(case, tmp_path, monkeypat
 def test_options_that_cannot_be_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         EvalConfig(**changes)
-
-
-def test_open_loop_takes_what_it_says():
-    taken = {f.name for f in fields(OpenLoopConfig)}
-    assert taken == {*OPEN_LOOP, *BOTH} - {"mode"}
 
 
 def test_a_checkpoint_of_another_robot_is_refused(checkpoint, tmp_path):

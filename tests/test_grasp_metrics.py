@@ -10,10 +10,9 @@ from hasm_torch.evaluation.grasp import (
     GraspCase,
     Guide,
     cases,
-    run_case,
     summarise,
 )
-from hasm_torch.evaluation.rollout import Human, roll_out
+from hasm_torch.evaluation.rollout import Human, roll_out, run_case
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.env import TouchPoint
 from hasm_torch.sim.tasks import GRASP_PATCH, LIFT_NOISE_SHARE, REACH_PATCH, noisy_start

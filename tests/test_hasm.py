@@ -21,7 +21,7 @@ from toys import (
 )
 
 from hasm_torch import HASM, HASMConfig, kernels
-from hasm_torch.model.hasm import RECALLS_A_STEP
+from hasm_torch.model.motion import RECALLS_A_STEP
 
 BODY = make_body(4)
 LOWER, UPPER = (torch.tensor(x, dtype=torch.float32) for x in limits(BODY))
@@ -91,7 +91,8 @@ def test_every_spike_moves_by_what_one_spike_did(yielding_model):
     for force in [3.0] * 20 + [9.0] * 10:
         target = yielding_model.step(state, press(BODY, "front", force))
         spikes = yielding_model.rollout.spikes[-1][0]
-        for patch, query in yielding_model.rollout.queries:
+        for asked in yielding_model.rollout.asked:
+            patch, query = asked.touch.patch, asked.query
             assert patch == 0
             signs = np.where(query.numpy() < 0, -1.0, 1.0)
             recalled = reference.softmax_recall(stored.T, values[: len(stored)].T, signs, beta)

@@ -4,10 +4,8 @@ import threading
 
 import numpy as np
 import pytest
-import torch
 
 from hasm_torch import kernels
-from hasm_torch.encoders.skin_filter import clean_skin
 from hasm_torch.kernels.compiling import compile_kernel
 
 
@@ -57,13 +55,3 @@ def test_a_compiled_function_is_interpreted_where_they_are_disabled():
             compiled(values, out)
         np.testing.assert_array_equal(out, 2 * values)
     assert calls == [4]
-
-
-def test_loops_that_have_no_torch_form_run_interpreted():
-    """The filter of faulty skins is one loop over arrays, compiled or not."""
-    skin = torch.rand(4, 3, 3, generator=torch.Generator().manual_seed(0))
-    share = np.full(3, 0.3, np.float32)
-    compiled, _ = clean_skin(skin, [2, 1], 50.0, share)
-    with kernels.disabled():
-        plain, _ = clean_skin(skin, [2, 1], 50.0, share)
-    torch.testing.assert_close(compiled, plain)

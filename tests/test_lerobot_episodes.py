@@ -1,4 +1,4 @@
-"""Reading datasets: layouts, names, units, windows and every way in which a dataset is broken."""
+"""Reading datasets: layouts, names, units and every way in which a dataset is broken."""
 
 import json
 import shutil
@@ -10,10 +10,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from hasm_torch.data import FeatureMap, load_episodes, windows
+from hasm_torch.data import FeatureMap, load_episodes
 
 FPS = 10
 LENGTHS = (4, 1, 7)
@@ -206,22 +204,6 @@ def test_other_feature_names(whole):
     data = load_episodes(whole, FeatureMap(state="action", tactile=None))
     np.testing.assert_array_equal(data.episodes[0].state, data.episodes[0].action)
     assert data.skin is None
-
-
-@settings(max_examples=50, deadline=None)
-@given(
-    length=st.integers(1, 8),
-    offsets=st.lists(st.integers(-10, 10), min_size=1, max_size=5),
-)
-def test_windows_by_definition(length, offsets):
-    values = np.arange(length, dtype=np.float32)[:, None] * [1, 10]
-    got, padded = windows(values, offsets)
-    assert got.shape == (length, len(offsets), 2)
-    for t in range(length):
-        for w, offset in enumerate(offsets):
-            inside = 0 <= t + offset < length
-            assert padded[t, w] == (not inside)
-            np.testing.assert_array_equal(got[t, w], values[min(max(t + offset, 0), length - 1)])
 
 
 # Broken datasets: each must say what was expected, what came and where.

@@ -402,9 +402,10 @@ def test_packed_memory_is_small():
         ({"code_dim": 0}, "code_dim must be at least 1"),
         ({"capacity": 0}, "capacity must be at least 1"),
         ({"storage": "float8"}, "valid: float32, bfloat16, int8, bit"),
-        ({"interaction": "cosine"}, "'softmax', 'exponential', or a degree"),
-        ({"interaction": 0}, "'softmax', 'exponential', or a degree"),
-        ({"when_full": "grow"}, "valid: error, overwrite"),
+        ({"interaction": "cosine"}, "'entmax15', 'exponential', or a degree"),
+        ({"interaction": 0}, "'entmax15', 'exponential', or a degree"),
+        ({"top_k": 0}, "top_k must be at least 1"),
+        ({"when_full": "wait"}, "valid: error, overwrite, grow"),
         ({"learn_patterns": True, "storage": "bit"}, "learned patterns need storage 'float32'"),
     ],
 )

@@ -20,12 +20,12 @@ from hasm_torch.evaluation import opponents
 from hasm_torch.evaluation.open_loop import (
     CONTESTANTS,
     STEPPED,
-    OpenLoopConfig,
     fold_episodes,
     open_loop,
     predict_fold,
     relative_errors,
 )
+from hasm_torch.evaluation.options import EvalConfig
 from hasm_torch.model.choose_timed import splits
 from hasm_torch.model.moments import TREND_RIDGE, Moments, Series, moments
 
@@ -170,7 +170,7 @@ def test_nothing_of_a_held_out_episode_is_learned(touched):
     predicted from the first frames stays the same to the last bit.
     """
     data = swings(5, touched)
-    config = OpenLoopConfig(model=TIMED)
+    config = EvalConfig("open_loop", model=TIMED)
     before = predict_fold(data, [2, 4], 3, config)
     changed = list(data.episodes)
     for i in (2, 4):
@@ -197,7 +197,7 @@ def test_a_leak_would_be_seen():
         state = rng.normal(size=(40, 2)).cumsum(axis=0).astype(np.float32)
         time = (np.arange(40) / FPS).astype(np.float32)
         walks.append(replace(swing(i), time=time, state=state, action=state))
-    sharp = OpenLoopConfig(model=HASMConfig(beta=1.0))
+    sharp = EvalConfig("open_loop", model=HASMConfig(beta=1.0))
     errors = []
     for episodes in (walks, [*walks, replace(walks[0], index=6)]):
         fold = predict_fold(dataset(episodes), [0], 1, sharp)
@@ -208,7 +208,7 @@ def test_a_leak_would_be_seen():
 
 def test_a_fold_holds_what_came():
     data = swings(6)  # episodes 1 and 5 stay in the range of the others
-    fold = predict_fold(data, [1, 5], 4, OpenLoopConfig())
+    fold = predict_fold(data, [1, 5], 4, EvalConfig("open_loop"))
     states = [data.episodes[i].state for i in (1, 5)]
     np.testing.assert_allclose(fold.state, np.concatenate([s[:-4] for s in states]))
     np.testing.assert_allclose(fold.real, np.concatenate([s[4:] - s[:-4] for s in states]), 1e-5)
@@ -223,7 +223,7 @@ def test_a_fold_holds_what_came():
 def test_what_touch_moves_is_predicted_from_some_frames():
     """Steps take longer than recalls; opponents are asked for the same frames."""
     data = dataset([pushed(i) for i in range(5)])
-    fold = predict_fold(data, [2], 3, OpenLoopConfig())
+    fold = predict_fold(data, [2], 3, EvalConfig("open_loop"))
     assert fold.choices["drive"] == "spike"
     frames = np.unique(np.linspace(0, 71, STEPPED).round().astype(int))
     state = data.episodes[2].state
@@ -258,8 +258,8 @@ def stored(tmp_path_factory) -> Path:
 
 
 def test_open_loop_writes_figures_and_says_what_it_did(stored, tmp_path, capsys):
-    config = OpenLoopConfig(
-        DatasetConfig(stored), model=TIMED, folds=2, horizon_s=0.4, output_dir=tmp_path
+    config = EvalConfig(
+        "open_loop", DatasetConfig(stored), model=TIMED, folds=2, horizon_s=0.4, output_dir=tmp_path
     )
     report = open_loop(config)
     written = json.loads((tmp_path / "open_loop.json").read_text())
@@ -283,8 +283,13 @@ def test_open_loop_writes_figures_and_says_what_it_did(stored, tmp_path, capsys)
 
 def test_the_paper_as_written_can_be_evaluated(tmp_path):
     root = write(tmp_path / "pushed", dataset([pushed(i) for i in range(3)]))
-    config = OpenLoopConfig(
-        DatasetConfig(root), method="literal", folds=2, horizon_s=0.3, output_dir=tmp_path
+    config = EvalConfig(
+        "open_loop",
+        DatasetConfig(root),
+        method="literal",
+        folds=2,
+        horizon_s=0.3,
+        output_dir=tmp_path,
     )
     report = open_loop(config)
     assert report["method"] == "literal"
@@ -306,7 +311,7 @@ def test_the_paper_as_written_can_be_evaluated(tmp_path):
 def test_impossible_options(stored, tmp_path, options, message):
     usual = {"dataset": DatasetConfig(stored), "folds": 2, "model": TIMED, "output_dir": tmp_path}
     with pytest.raises(ValueError, match=message):
-        open_loop(OpenLoopConfig(**{**usual, **options}))
+        open_loop(EvalConfig("open_loop", **{**usual, **options}))
     assert not list(tmp_path.iterdir())
 
 
@@ -336,7 +341,7 @@ def test_real_recordings_are_predicted_better_than_by_neighbours():
     data = load_episodes(RECORDINGS / "icub_grasp")
     data = replace(data, episodes=data.episodes[::3])
     part = fold_episodes(len(data), 5, np.random.default_rng(0))[0]
-    found = predict_fold(data, part, 5, OpenLoopConfig())
+    found = predict_fold(data, part, 5, EvalConfig("open_loop"))
     span = np.ptp(np.concatenate([episode.state for episode in data]), axis=0)
     mine, theirs = (
         relative_errors(found.by[who], found.real, span)[0] for who in ("hasm", "neighbours")

@@ -10,7 +10,7 @@ from toys import along, make_body, postures, press, push, ranges, yielding
 from benchmarks import policies
 from benchmarks.baselines.contestants import SETTINGS, load, save, train
 from benchmarks.baselines.demonstrations import Sensed, Series, Units, folds
-from benchmarks.baselines.faults import Fault, Filter, Skinned
+from benchmarks.baselines.faults import Fault, Faulty
 from benchmarks.baselines.learned_training import Training
 from benchmarks.baselines.neighbours import (
     HORIZON,
@@ -22,7 +22,9 @@ from benchmarks.baselines.neighbours import (
     nearest,
 )
 from hasm_torch.body import Body
+from hasm_torch.encoders.skin_filter import SkinFilter
 from hasm_torch.episode import Episode
+from hasm_torch.evaluation.filtered import Filtered
 
 
 @dataclass
@@ -173,7 +175,7 @@ def test_standing_still_stands_still():
 
 def read_of(fault: Fault, skin: torch.Tensor, steps: int, start: float = 0.0) -> torch.Tensor:
     reader = Reader([])
-    policy = Skinned(reader, fault, None)
+    policy = Faulty(reader, fault)
     policy.reset()
     for step in range(steps):
         policy.step(torch.full((2,), start + step), skin)
@@ -206,7 +208,7 @@ def test_all_policies_meet_the_same_damage():
     """Damage depends on where a rollout begins alone."""
     skin, fault = torch.ones(30), Fault("noise", 0.5)
     reader = Reader([])
-    policy = Skinned(reader, fault, None)
+    policy = Faulty(reader, fault)
     for steps in (7, 2):
         policy.reset()
         for step in range(steps):
@@ -225,9 +227,9 @@ def test_the_filter_stands_behind_the_faults():
     body, reader = make_body(), Reader([])
     skin = press(body, "side", 6.0)
     shares = np.array([0, 1, 1, 1, 0, 0], np.float32) / 3
-    known = Filter(body.cells, body.rate, shares)
-    for fault in (None, Fault("lost", 1.0)):
-        policy = Skinned(reader, fault, known)
+    filtered = Filtered(reader, SkinFilter(body.cells, body.rate, shares))
+    for policy in (filtered, Faulty(filtered, Fault("lost", 1.0))):
+        policy.reset()
         policy.step(torch.zeros(3), skin)
     sound, lost = (read[-1] for read in reader.read)
     assert torch.equal(sound, skin)

@@ -54,15 +54,28 @@ def test_tables_of_all_pages_are_written(tmp_path, evaluated):
     part = {"seconds_ahead": 0.5, "hasm": 0.41, "ridge": 0.6, "neighbours": None}
     report = {"one_step": part | {"seconds_ahead": 0.02}, "horizon": part}
     figures = {"share_07_of_teacher": 0.9, "share_07_of_teacher_interval": [0.8, 0.95]}
+    session = {
+        "pushes": 96, "lessons": 8, "taught_s": 113.2, "learned_s": 0.87,
+        "tested": {"share_07_of_teacher": 0.8},
+        "forgotten": {"weight_before": 0.7, "weight_after": 0.0},
+        "grasp": {"lifted": 5, "starts": 5},
+    }  # fmt: skip
     results = {
         "eval_default": evaluated, "eval_literal": evaluated, "open_loop_icub": report,
+        "open_loop_g1": report,
         "yield_controls": {"sizes": {"10": {"argmax": figures}}},
         "rules": {"variants": {"no tether": figures | {"travel_of_teacher": 1.02}}},
+        "teach_in_two_minutes": session, "teach_single_pushes": session | {"pushes": 8},
+        "skin_filter": {"faults": {"lost 0.5": {
+            variant: {"yield": figures | {"travel_of_teacher": way}, "compliance": {"success": 1}}
+            for variant, way in (("no filter", 0.4), ("whole", 0.8), ("without lost", 0.3))
+        }}},
     }  # fmt: skip
     both = PAGE.format("default") + PAGE.format("literal")
-    rest = "".join(PAGE.format(name) for name in ("yield", "open_loop", "controls", "rules"))
+    names = ("yield", "open_loop", "controls", "rules", "skin_filter", "teach")
+    rest = "".join(PAGE.format(name) for name in names)
     done = readme_tables.write(*folder(tmp_path, results, readme=both, method=rest))
-    assert len(done) == 6
+    assert len(done) == 8
     readme, method = (tmp_path / "README.md").read_text(), (tmp_path / "docs/method.md").read_text()
     assert "stale" not in readme + method
     assert readme.count("before") == readme.count("after") == 2
@@ -73,6 +86,10 @@ def test_tables_of_all_pages_are_written(tmp_path, evaluated):
     assert "| iCub | 0.5 s | 0.41 | none | 0.6 |" in method
     assert "| argmax | 0.90 (0.80 to 0.95) |" in method
     assert "| no tether | 0.90 (0.80 to 0.95) | 1.02 |" in method
+    assert "| lost 0.5 | 0.90, 0.40, 1.00 | 0.90, 0.80, 1.00 | 0.90, 0.30, 1.00 |" in method
+    assert "| G1 | 0.5 s | 0.41 | none | 0.6 |" in method
+    assert "| pushes shown | 96 | 8 |" in method
+    assert "| time of learning, all lessons | 0.87 s | 0.87 s |" in method
     again = readme_tables.write(tmp_path / "results", tmp_path)
     assert again == done
     assert (tmp_path / "README.md").read_text() == readme

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.memory.recall import inspect_dense, recall_dense, recall_weights
+from hasm_torch.memory.recall import Stored, inspect_dense, recall_dense, weights_dense
 
 
 def reference(query, associations, successors, beta, taking_part=None):
@@ -46,11 +46,12 @@ def test_decision_matches_the_reference(seed, rows, dim, beta, data):
         query, codes, successors, beta, mask & (np.arange(rows) < count)
     )
     arguments = (torch.from_numpy(codes).float(), torch.from_numpy(successors).float(), beta)
-    limits = {"count": torch.tensor(count), "mask": torch.from_numpy(mask)}
-    decision = recall_dense(torch.from_numpy(query).float(), *arguments, **limits)
+    limits = {"held": torch.tensor(count), "mask": torch.from_numpy(mask)}
+    decision = recall_dense(torch.from_numpy(query).float(), Stored(*arguments, **limits))
     np.testing.assert_allclose(decision.numpy(), expected, atol=1e-5)
-    found = recall_weights(
-        torch.from_numpy(query).float(), arguments[0], beta, limits["count"], limits["mask"]
+    found = weights_dense(
+        torch.from_numpy(query).float(),
+        Stored(arguments[0], arguments[0], beta, limits["held"], limits["mask"]),
     )
     np.testing.assert_allclose(found.numpy(), weights, atol=1e-5)
 
@@ -63,9 +64,7 @@ def test_every_storage_of_bipolar_codes_decides_alike(dtype):
     expected = reference(query, codes, successors, 0.02)[0]
     decision = recall_dense(
         torch.from_numpy(query).float(),
-        torch.from_numpy(codes).to(dtype),
-        torch.from_numpy(successors).float(),
-        0.02,
+        Stored(torch.from_numpy(codes).to(dtype), torch.from_numpy(successors).float(), 0.02),
     )
     assert decision.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
     np.testing.assert_allclose(decision.numpy(), expected, atol=1e-5)
@@ -76,9 +75,7 @@ def test_narrow_storage_is_widened_in_parts(monkeypatch):
     monkeypatch.setattr("hasm_torch.memory.recall.dense._WIDENED_ENTRIES", 16 * 7)
     decision = recall_dense(
         torch.from_numpy(codes[3]).float(),
-        torch.from_numpy(codes).to(torch.int8),
-        torch.from_numpy(successors).float(),
-        0.3,
+        Stored(torch.from_numpy(codes).to(torch.int8), torch.from_numpy(successors).float(), 0.3),
     )
     np.testing.assert_allclose(
         decision.numpy(), reference(codes[3], codes, successors, 0.3)[0], atol=1e-5
@@ -92,12 +89,17 @@ def test_a_memory_for_every_sample_and_one_for_all():
     mask = rng.random((4, 5, 20)) < 0.8
     mask[..., 0] = True
     decision = recall_dense(
-        *map(torch.from_numpy, (query, codes, successors)),
-        0.7,
-        count=torch.from_numpy(count),
-        mask=torch.from_numpy(mask),
+        torch.from_numpy(query),
+        Stored(
+            *map(torch.from_numpy, (codes, successors)),
+            0.7,
+            held=torch.from_numpy(count),
+            mask=torch.from_numpy(mask),
+        ),
     )
-    shared = recall_dense(*map(torch.from_numpy, (query, codes[0], successors[0])), 0.7)
+    shared = recall_dense(
+        torch.from_numpy(query), Stored(*map(torch.from_numpy, (codes[0], successors[0])), 0.7)
+    )
     for sample in range(4):
         for number in range(5):
             part = mask[sample, number] & (np.arange(20) < count[sample])
@@ -113,7 +115,9 @@ def test_a_memory_for_every_sample_and_one_for_all():
 def test_statistics(beta):
     codes, successors, rng = memory(4, 40, 31, 2)
     query = np.where(rng.random((6, 31)) < 0.5, 1.0, -1.0)
-    found = inspect_dense(*map(torch.from_numpy, (query, codes, successors)), beta)
+    found = inspect_dense(
+        torch.from_numpy(query), Stored(*map(torch.from_numpy, (codes, successors)), beta)
+    )
     for number in range(6):
         decision, weights, scores = reference(query[number], codes, successors, beta)
         ranked = -scores if beta < 0 else scores
@@ -129,7 +133,7 @@ def test_statistics(beta):
 def test_ties_take_the_first_and_have_no_margin():
     codes = torch.tensor([[1.0, -1.0], [1.0, 1.0], [1.0, 1.0]])
     found = inspect_dense(
-        torch.tensor([1.0, 1.0]), codes, torch.tensor([[0.0], [1.0], [3.0]]), 20.0
+        torch.tensor([1.0, 1.0]), Stored(codes, torch.tensor([[0.0], [1.0], [3.0]]), 20.0)
     )
     assert found.match == 1
     assert found.margin == 0.0
@@ -139,11 +143,11 @@ def test_ties_take_the_first_and_have_no_margin():
 
 def test_one_row_has_nothing_to_lead_and_none_gives_nan():
     codes, successors = torch.ones(3, 4), torch.ones(3, 2)
-    alone = inspect_dense(torch.ones(4), codes, successors, 1.0, count=torch.tensor(1))
+    alone = inspect_dense(torch.ones(4), Stored(codes, successors, 1.0, held=torch.tensor(1)))
     assert alone.margin == torch.inf
     assert alone.entropy == 0.0
     none = inspect_dense(
-        torch.ones(4), codes, successors, 1.0, mask=torch.zeros(3, dtype=torch.bool)
+        torch.ones(4), Stored(codes, successors, 1.0, mask=torch.zeros(3, dtype=torch.bool))
     )
     assert none.match == -1
     assert all(torch.isnan(none[field]).all() for field in (0, 2, 3, 4))
@@ -153,7 +157,9 @@ def test_rows_beyond_the_count_get_no_weight_and_no_gradient():
     codes, successors, _ = memory(5, 6, 8, 2)
     stored = torch.from_numpy(codes).requires_grad_()
     values = torch.from_numpy(successors).requires_grad_()
-    recall_dense(stored[0].detach(), stored, values, 0.5, count=torch.tensor(4)).sum().backward()
+    recall_dense(
+        stored[0].detach(), Stored(stored, values, 0.5, held=torch.tensor(4))
+    ).sum().backward()
     for gradient in (stored.grad, values.grad):
         assert torch.isfinite(gradient).all()
         assert gradient[:4].abs().sum() > 0
@@ -169,7 +175,7 @@ def test_gradients():
     beta = torch.tensor(0.8, dtype=torch.float64, requires_grad=True)
     count = torch.tensor([5, 3])
     assert torch.autograd.gradcheck(
-        lambda *inputs: recall_dense(*inputs, count=count),
+        lambda query, *inputs: recall_dense(query, Stored(*inputs, held=count)),
         (query, stored, successors, beta),
         fast_mode=True,
     )
@@ -182,7 +188,7 @@ def test_filling_the_memory_does_not_recompile():
     torch._dynamo.reset()
     with torch._dynamo.config.patch(error_on_recompile=True):
         for count in (1, 5, 32):
-            arguments = (stored[2], stored, values, torch.tensor(1.5), torch.tensor(count))
+            arguments = stored[2], Stored(stored, values, torch.tensor(1.5), torch.tensor(count))
             torch.testing.assert_close(compiled(*arguments), recall_dense(*arguments))
 
 
@@ -198,4 +204,6 @@ def test_filling_the_memory_does_not_recompile():
 def test_shapes_that_do_not_fit_are_refused(query, stored, successors, mask):
     limit = None if mask is None else torch.ones(mask, dtype=torch.bool)
     with pytest.raises(ValueError, match="expected"):
-        recall_dense(torch.ones(query), torch.ones(stored), torch.ones(successors), 1.0, mask=limit)
+        recall_dense(
+            torch.ones(query), Stored(torch.ones(stored), torch.ones(successors), 1.0, mask=limit)
+        )

@@ -1,4 +1,4 @@
-"""The Triton kernels against the CPU's scan: on a GPU, and in Triton's interpreter without one."""
+"""Recall on a GPU against the CPU's scan, and the Triton kernel in its interpreter without one."""
 
 import os
 import subprocess
@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import pytest
 import torch
 
-from hasm_torch.memory.recall import Recall, inspect_packed, pack
+from hasm_torch.memory.recall import Stored, inspect_packed, pack
 
 # (batch, rows, dim, queries, values, beta, masked)
 CASES = [
@@ -32,8 +32,7 @@ def draw(batch, rows, dim, queries, values, beta, masked):
     if masked:
         mask = torch.rand(*batch, queries, rows, generator=generator) < 0.5
         mask[..., 0, :] = False
-    return (
-        query,
+    return query, Stored(
         pack(codes),
         torch.randn(*batch, rows, values, generator=generator),
         torch.tensor(beta),
@@ -47,15 +46,18 @@ def assert_same(found, expected):
         torch.testing.assert_close(left.cpu(), right, atol=1e-5, rtol=1e-5, equal_nan=True)
 
 
+def on_gpu(memory):
+    return Stored(*(part.cuda() if torch.is_tensor(part) else part for part in memory))
+
+
 def compare_interpreted():
-    from hasm_torch.memory.recall.packed import _pack_codes
-    from hasm_torch.memory.recall.packed_gpu import scan_gpu
+    from hasm_torch.memory.recall.packed import _distances, _pack_codes
+    from hasm_torch.memory.recall.packed_gpu import distances_gpu
 
     for case in CASES:
-        query, *memory = draw(*case)
-        signs = _pack_codes(-query if case[5] < 0 else query)
-        decision, match, certainty = scan_gpu(signs, *memory, dim=query.shape[-1])
-        assert_same(Recall(decision, match, *certainty), inspect_packed(query, *memory))
+        query, memory = draw(*case)
+        packed = _pack_codes(query), memory.associations
+        assert torch.equal(distances_gpu(*packed), _distances(*packed))
 
 
 @pytest.mark.skipif(find_spec("triton") is None, reason="needs Triton")
@@ -68,19 +70,18 @@ def test_interpreted_kernels_agree_with_the_cpu():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("interaction", ["softmax", "sparsemax", "entmax15"])
 @pytest.mark.parametrize("case", CASES)
-def test_the_gpu_agrees_with_the_cpu(case):
-    arguments = draw(*case)
-    moved = [None if part is None else part.cuda() for part in arguments]
-    assert_same(inspect_packed(*moved), inspect_packed(*arguments))
+def test_the_gpu_agrees_with_the_cpu(case, interaction):
+    query, memory = draw(*case)
+    memory = memory._replace(interaction=interaction)
+    assert_same(inspect_packed(query.cuda(), on_gpu(memory)), inspect_packed(query, memory))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_a_large_memory_on_the_gpu():
-    arguments = draw((), 200_001, 400, 40, 8, 0.2, False)
-    assert_same(
-        inspect_packed(*(part.cuda() for part in arguments[:-1])), inspect_packed(*arguments)
-    )
+    query, memory = draw((), 200_001, 400, 40, 8, 0.2, False)
+    assert_same(inspect_packed(query.cuda(), on_gpu(memory)), inspect_packed(query, memory))
 
 
 if __name__ == "__main__":

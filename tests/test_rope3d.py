@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hasm_torch.encoders.bipolar import to_bipolar
-from hasm_torch.encoders.rope3d import RoPE3D, rope3d, touch_rotation
+from hasm_torch.encoders.rope3d import RoPE3D, rope3d
 
 DEVICES = ["cpu"] + (["cuda"] if torch.cuda.is_available() else [])
 DIMS = (3, 4, 5, 24, 200)
@@ -137,68 +137,6 @@ def test_module_compiles_whole_and_copies():
     assert torch.equal(copied(x, axis, angle), module(x, axis, angle))
 
 
-@given(seed=st.integers(0, 999), scale=st.sampled_from([1e-20, 1.0, 1e15]))
-@settings(max_examples=20, deadline=None)
-def test_touch_rotation_takes_the_reference_to_the_touch(seed, scale):
-    direction, start, _ = (scale * t for t in sample(3, seed, batch=1))
-    direction, start = direction[0], start[0]
-    axis, angle = touch_rotation(direction, start)
-    assert 0 <= angle.item() <= math.pi
-    torch.testing.assert_close(axis.norm().item(), 1.0)
-    turned = rotation(axis, angle) @ (start / start.norm())
-    torch.testing.assert_close(turned, direction / direction.norm())
-
-
-REFERENCES = [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -2.0, 0.0), (0.3, -0.4, 0.5)]
-
-
-@pytest.mark.parametrize("start", REFERENCES)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_opposite_touches_share_one_perpendicular_axis(start, dtype):
-    start = torch.tensor(start, dtype=dtype)
-    noise = 2 * torch.finfo(dtype).eps * torch.randn(
-        50, 3, generator=torch.Generator().manual_seed(0), dtype=dtype
-    )  # fmt: skip
-    axis, angle = touch_rotation(-start + start.norm() * noise, start)
-    assert torch.equal(axis, axis[:1].expand_as(axis))
-    assert (axis @ start).abs().max() < 1e-6
-    torch.testing.assert_close(axis.norm(dim=-1), torch.ones(50, dtype=dtype))
-    torch.testing.assert_close(angle, torch.full((50,), math.pi, dtype=dtype))
-
-
-@pytest.mark.parametrize("start", REFERENCES)
-def test_touch_rotation_has_finite_values_and_gradients(start):
-    start = torch.tensor(start)
-    zero = torch.zeros(3)
-    tiny = torch.tensor([1e-7, 2e-7, -1e-7])
-    for direction in (start, -start, zero, start + tiny, -start + tiny, -start + 1e4 * tiny):
-        direction = direction.clone().requires_grad_()
-        axis, angle = touch_rotation(direction, start)
-        turned = rope3d(torch.arange(7.0), axis, angle)
-        (turned.square() * torch.arange(7.0)).sum().backward()
-        for value in (axis, angle, turned, direction.grad):
-            assert torch.isfinite(value).all()
-    assert touch_rotation(zero, start)[1] == 0
-    assert touch_rotation(start, start)[1] < 1e-6
-
-
-def test_touch_rotation_is_continuous_near_the_reference():
-    """Axes point all ways round there, yet the turned codes come together."""
-    x = torch.arange(6.0, dtype=torch.float64)
-    ways = torch.tensor([[1.0, 0, 0], [0, 1, 0], [-1, -1, 0]], dtype=torch.float64)
-    for distance in (1e-3, 1e-6, 1e-9, 0.0):
-        touch = torch.tensor([0.0, 0, 1], dtype=torch.float64) + distance * ways
-        assert (rope3d(x, *touch_rotation(touch)) - x).abs().max() <= 20 * distance
-
-
-def test_touch_rotation_gradients():
-    direction = torch.tensor([[0.2, -0.5, 0.9], [0.1, 0.3, -0.7]], dtype=torch.float64)
-    assert torch.autograd.gradcheck(touch_rotation, (direction.requires_grad_(),))
-    compiled = torch.compile(touch_rotation, fullgraph=True, backend="eager")
-    for ours, theirs in zip(compiled(direction), touch_rotation(direction), strict=True):
-        torch.testing.assert_close(ours, theirs)
-
-
 def test_errors_say_what_was_expected():
     with pytest.raises(ValueError, match=r"dim >= 1.*got 0"):
         RoPE3D(0)
@@ -206,7 +144,3 @@ def test_errors_say_what_was_expected():
         RoPE3D(10)(torch.zeros(4, 9), torch.zeros(3), torch.zeros(()))
     with pytest.raises(ValueError, match=r"axis of shape \(\.\.\., 3\), got \(2,\)"):
         rope3d(torch.zeros(9), torch.zeros(2), torch.zeros(()))
-    with pytest.raises(ValueError, match=r"direction of shape \(\.\.\., 3\), got \(2,\)"):
-        touch_rotation(torch.zeros(2))
-    with pytest.raises(ValueError, match=r"reference of shape \(\.\.\., 3\), got \(2,\)"):
-        touch_rotation(torch.zeros(3), (0.0, 1.0))

@@ -67,7 +67,7 @@ def test_where_the_object_is_turns_with_the_base(grasp):
     for _ in range(150):
         observation, *_ = grasp.step(target)
         assert grasp.observation_space.contains(observation)
-        pose = HSR.pose(torch.from_numpy(grasp.joint_position), BASE_FRAME).numpy()
+        pose = HSR.forward(torch.from_numpy(grasp.joint_position))[BASE_FRAME].numpy()
         expected = pose[:3, :3].T @ (grasp.object_position - pose[:3, 3])
         np.testing.assert_allclose(observation["environment_state"], expected, atol=1e-5)
     np.testing.assert_allclose(grasp.object_position, place, atol=1e-3)  # it did not move itself

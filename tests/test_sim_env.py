@@ -67,11 +67,11 @@ def test_a_seed_fixes_everything(env):
 
 
 def test_limits_are_those_of_the_urdf(env):
-    kinematics = Kinematics()
-    np.testing.assert_allclose(env.joint_lower, kinematics.lower.numpy())
-    np.testing.assert_allclose(env.joint_upper, kinematics.upper.numpy())
+    joints = [Kinematics().robot.joints[name] for name in JOINTS]
+    np.testing.assert_allclose(env.joint_lower, [joint.lower for joint in joints])
+    np.testing.assert_allclose(env.joint_upper, [joint.upper for joint in joints])
     # Half of the arm's lift is the torso's, whose limit is half the arm's.
-    np.testing.assert_allclose(env.joint_speed_limit, kinematics.velocity.numpy())
+    np.testing.assert_allclose(env.joint_speed_limit, [joint.velocity for joint in joints])
 
 
 def test_links_are_where_the_kinematics_say(env):

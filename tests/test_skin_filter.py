@@ -6,7 +6,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hasm_torch.encoders.skin_filter import HOLD_S, PROBATION_S, Footprint, clean_skin
+from hasm_torch.body import Body
+from hasm_torch.encoders.skin_filter import HOLD_S, PROBATION_S, RULES, SkinFilter
+from hasm_torch.episode import Episode
 
 CELLS, RATE = [7, 7, 7, 7, 6, 5], 50.0
 TOTAL = sum(CELLS)
@@ -15,8 +17,18 @@ NOTHING = np.zeros(TOTAL, np.float32)
 SHARES = np.array([0.93, *[0.07 / 6] * 6])
 
 
-def clean(skin: torch.Tensor, footprint: np.ndarray = NOTHING) -> torch.Tensor:
-    return clean_skin(skin, CELLS, RATE, footprint)[0]
+def clean(skin: torch.Tensor, footprint: np.ndarray = NOTHING, **options) -> torch.Tensor:
+    return SkinFilter(CELLS, RATE, footprint, **options)(skin)[0]
+
+
+def learned(*skins: torch.Tensor) -> np.ndarray:
+    """Shares of the cells over these recordings."""
+    names = [f"patch {number}" for number in range(len(CELLS))]
+    normals = [[0.0, 0.0, 1.0]] * TOTAL
+    body = Body(["elbow"], [0.0], [1.0], [1.0], names, CELLS, normals, rate=RATE)
+    still = np.zeros((0, 1), np.float32)
+    episodes = [Episode(0, "", still, still, still, skin.numpy()) for skin in skins]
+    return SkinFilter.learn(body, episodes).footprint
 
 
 def touched(force: np.ndarray, patch: int = 1) -> torch.Tensor:
@@ -39,10 +51,7 @@ def newtons(skin: torch.Tensor) -> np.ndarray:
     return torch.stack([p.abs().sum((1, 2)) for p in skin.split(CELLS, dim=1)], 1).numpy()
 
 
-FOOTPRINT_SKIN = Footprint(CELLS)
-for _patch in range(4):
-    FOOTPRINT_SKIN.add(touched(push(60, 8.0), _patch))
-FOOTPRINT = FOOTPRINT_SKIN.shares().numpy()
+FOOTPRINT = learned(*(touched(push(60, 8.0), patch) for patch in range(4)))
 
 
 @given(forces=st.lists(st.floats(0.05, 14.0), min_size=1, max_size=3), patch=st.integers(0, 2),
@@ -60,9 +69,9 @@ def test_chunks_equal_the_whole(parts, seed):
     skin = touched(push(sum(parts), 6.0, seed))
     skin = (skin + 0.3 * torch.from_numpy(rng.standard_normal(skin.shape)).float()).clamp(min=0)
     skin[rng.random(len(skin)) < 0.2] = 0.0
-    state, pieces = None, []
+    state, pieces, skin_filter = None, [], SkinFilter(CELLS, RATE, FOOTPRINT)
     for chunk in skin.split(parts):
-        piece, state = clean_skin(chunk, CELLS, RATE, FOOTPRINT, state)
+        piece, state = skin_filter(chunk, state)
         pieces.append(piece)
     assert torch.equal(torch.cat(pieces), clean(skin, FOOTPRINT))
 
@@ -110,7 +119,7 @@ def test_an_offset_of_the_whole_skin_is_taken_out():
 def test_a_body_of_few_patches_may_be_held_all_over():
     cells = [4, 4, 4]
     skin = torch.full((50, 12, 3), 0.5)
-    cleaned, _ = clean_skin(skin, cells, RATE, np.zeros(12, np.float32))
+    cleaned, _ = SkinFilter(cells, RATE, np.zeros(12, np.float32))(skin)
     assert torch.equal(cleaned, skin)
 
 
@@ -163,21 +172,35 @@ def test_a_stuck_cell_that_comes_back_is_heard_again():
 
 
 def test_a_footprint_leaves_out_cells_that_a_touch_may_miss():
-    estimate = Footprint(CELLS)
     skin = touched(push(50, 8.0), 0)
-    estimate.add(skin)
-    np.testing.assert_allclose(estimate.shares()[:7], SHARES, rtol=1e-4)
+    np.testing.assert_allclose(learned(skin)[:7], SHARES, rtol=1e-4)
     beside = skin.clone()
     beside[:, 4] = 0.0
-    estimate.add(beside)
-    shares = estimate.shares()
+    shares = learned(skin, beside)
     assert shares[4] == 0
     assert (shares[[0, 1, 2, 3, 5, 6]] > 0).all()
     assert not shares[7:].any()  # never touched
 
 
-def test_shapes_are_checked():
+def test_a_rule_that_is_left_out_leaves_its_fault():
+    skin = touched(push(100, 6.0, 2))
+    dead, lost, stuck = skin.clone(), skin.clone(), skin.clone()
+    dead[:, CELLS[0]] = 0.0
+    lost[20] = 0.0
+    stuck[:, 0] = 0.5
+    noise = torch.from_numpy(np.random.default_rng(0).standard_normal(skin.shape)).float()
+    faulty = {"dead": dead, "lost": lost, "stuck": stuck, "offset": skin + 0.2,
+              "noise": (skin + 0.5 * noise).clamp(min=0)}  # fmt: skip
+    for rule in RULES:
+        felt, real = newtons(clean(faulty[rule], FOOTPRINT)), newtons(skin)
+        left = newtons(clean(faulty[rule], FOOTPRINT, without=[rule]))
+        assert np.abs(left - real).mean() > 3 * np.abs(felt - real).mean(), rule
+
+
+def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match=r"expected skin \(T, 39, 3\)"):
-        clean_skin(torch.zeros(5, 38, 3), CELLS, RATE, NOTHING)
+        clean(torch.zeros(5, 38, 3))
     with pytest.raises(ValueError, match=r"footprint \(39,\)"):
-        clean_skin(torch.zeros(5, TOTAL, 3), CELLS, RATE, NOTHING[:-1])
+        clean(torch.zeros(5, TOTAL, 3), NOTHING[:-1])
+    with pytest.raises(ValueError, match=r"unknown rules \['odd'\], valid: lost, noise"):
+        clean(torch.zeros(5, TOTAL, 3), without=["odd"])

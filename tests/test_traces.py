@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hasm_torch.evaluation.along_force import SETTLED_AFTER
-from hasm_torch.evaluation.runner import make_env, make_teacher, run_case
+from hasm_torch.evaluation.rollout import run_case
+from hasm_torch.evaluation.runner import make_env, make_teacher
 from hasm_torch.evaluation.traces import write_traces
 from hasm_torch.evaluation.yielding import cases
 from hasm_torch.robot import JOINTS
@@ -16,7 +17,7 @@ def rolled():
     env = make_env("yield")
     teacher = make_teacher("yield", env)
     kinds = ("even", "two_patches")
-    rollouts = [run_case("yield", case, env, teacher) for case in cases(2, 0, kinds=kinds)]
+    rollouts = [run_case(case, env, teacher) for case in cases(2, 0, kinds=kinds)]
     env.close()
     return rollouts
 

@@ -38,7 +38,7 @@ def test_the_table_gives_what_the_nearest_sample_did(data, tmp_path):
     few = replace(data, episodes=[*data.episodes[:3], data.episodes[-1]])
     model = HASM(MEAN, body_of(few))
     model.fit(few)
-    save_nearest(model, few.episodes, tmp_path)
+    save_nearest(model, tmp_path)
     table = load(str(tmp_path))
     assert table.settled is not None
     stored = np.load(tmp_path / "nearest.npz")

@@ -13,14 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.baselines.faults import Fault, Filter, Skinned
+from benchmarks.baselines.faults import Fault, Faulty
 from benchmarks.baselines.learned import ACT, DIFFUSION, ChunkPolicy
 from benchmarks.baselines.learned_training import Training
 from benchmarks.baselines.neighbours import Neighbours, StandStill
 from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig
-from hasm_torch.encoders.skin_filter import Footprint
+from hasm_torch.encoders.skin_filter import SkinFilter
 from hasm_torch.episode import Episode
+from hasm_torch.evaluation.filtered import Filtered
 from hasm_torch.evaluation.rollout import Policy
 from hasm_torch.model.hasm import HASM
 
@@ -47,7 +48,7 @@ LIBRARIES = (
     "lerobot.policies.diffusion.modeling_diffusion",
     "diffusers",
 )
-POLICY, FILTER = "policy.pt", "filter.npz"
+POLICY, FILTER = "policy.pt", "filter.pt"
 
 
 class Contestant(Policy, Protocol):
@@ -121,11 +122,7 @@ def save(policy: Policy, body: Body, episodes: Sequence[Episode], directory: Pat
         policy.save_pretrained(directory)
     else:
         torch.save(policy, directory / POLICY)
-    footprint = Footprint(body.cells)
-    for episode in episodes:
-        footprint.add(torch.from_numpy(np.asarray(episode.tactile)))
-    shares = footprint.shares().numpy()
-    np.savez(directory / FILTER, cells=body.cells, rate=body.rate, footprint=shares)
+    torch.save(SkinFilter.learn(body, episodes), directory / FILTER)
 
 
 def load(directory: str, fault: Fault | None = None, filtered: bool = False) -> Policy:
@@ -141,13 +138,9 @@ def load(directory: str, fault: Fault | None = None, filtered: bool = False) -> 
         policy: Policy = torch.load(path / POLICY, weights_only=False)
     else:
         policy = HASM.from_pretrained(path)
-    if fault is None and not filtered:
-        return policy
-    known = None
     if filtered:
-        stored = np.load(path / FILTER)
-        known = Filter(stored["cells"].tolist(), float(stored["rate"]), stored["footprint"])
-    return Skinned(policy, fault, known)
+        policy = Filtered(policy, torch.load(path / FILTER, weights_only=False))
+    return policy if fault is None else Faulty(policy, fault)
 
 
 def loader(fault: Fault | None, filtered: bool) -> Any:

@@ -1,4 +1,4 @@
-"""Faults of the skin, and the filter against them, around any policy."""
+"""Faults of the skin in front of any policy."""
 
 import zlib
 from dataclasses import dataclass
@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hasm_torch.encoders.skin_filter import FilterState, clean_skin
 from hasm_torch.evaluation.rollout import Policy
 
 Kind = Literal["dead", "noise", "lost", "offset", "stuck"]
@@ -39,59 +38,36 @@ class Fault:
             )
 
 
-@dataclass(frozen=True)
-class Filter:
-    """What the filter knows of a skin.
-
-    Attributes:
-        cells: Number of cells of each patch.
-        rate: Sampling rate, Hz.
-        footprint: (cells,) shares of its patch's force that each cell takes.
-    """
-
-    cells: list[int]
-    rate: float
-    footprint: NDArray[np.float32]
-
-
-class Skinned:
-    """A policy that reads a damaged skin, a filtered one, or both.
+class Faulty:
+    """A policy that reads a damaged skin.
 
     The damage of a rollout depends on the state in which it begins alone, so that all policies
     meet the same one.
 
     Args:
         policy: The policy.
-        fault: What is wrong, if anything.
-        filtered: The filter, if there is one.
+        fault: What is wrong.
     """
 
-    def __init__(self, policy: Policy, fault: Fault | None, filtered: Filter | None) -> None:
-        self.policy, self.fault, self.filter = policy, fault, filtered
-        self.reset()
+    def __init__(self, policy: Policy, fault: Fault) -> None:
+        self.policy, self.fault = policy, fault
+        self.rng: np.random.Generator | None = None
+        self.cells: NDArray[np.int64] = np.zeros(0, np.int64)
 
     def reset(self) -> None:
         """Start a new rollout."""
-        self.rng: np.random.Generator | None = None
-        self.cells: NDArray[np.int64] = np.zeros(0, np.int64)
-        self.filtered: FilterState | None = None
+        self.rng = None
         self.policy.reset()
 
     def step(self, state: Tensor, skin: Tensor, **more: Any) -> Tensor:
         """One control step of the policy, with what it reads."""
         points: NDArray[np.float64] = skin.double().numpy().reshape(-1, 3)
-        if self.fault is not None:
-            if self.rng is None:
-                self.rng = np.random.default_rng(zlib.crc32(state.numpy().tobytes()))
-                count = {"dead": round(self.fault.level * len(points)), "stuck": 1}
-                order = self.rng.permutation(len(points))
-                self.cells = order[: count.get(self.fault.kind, 0)]
-            points = self._damaged(points, self.fault, self.rng)
-        read = torch.from_numpy(points.astype(np.float32))
-        if self.filter is not None:
-            cells, rate, footprint = self.filter.cells, self.filter.rate, self.filter.footprint
-            cleaned, self.filtered = clean_skin(read[None], cells, rate, footprint, self.filtered)
-            read = cleaned[0]
+        if self.rng is None:
+            self.rng = np.random.default_rng(zlib.crc32(state.numpy().tobytes()))
+            count = {"dead": round(self.fault.level * len(points)), "stuck": 1}
+            order = self.rng.permutation(len(points))
+            self.cells = order[: count.get(self.fault.kind, 0)]
+        read = torch.from_numpy(self._damaged(points, self.fault, self.rng).astype(np.float32))
         return self.policy.step(state, read.reshape(skin.shape), **more)
 
     def _damaged(

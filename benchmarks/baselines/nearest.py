@@ -5,7 +5,6 @@ of the samples on the same rigid part, the nearest in joints (shares of their ra
 of the force. How much a direction counts is chosen by predicting left-out episodes.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hasm_torch.body import Body
-from hasm_torch.episode import Episode
 from hasm_torch.model.choose import recalled_values
-from hasm_torch.model.collect import collect
 from hasm_torch.model.control import Touched
 from hasm_torch.model.hasm import HASM
 from hasm_torch.model.recalling import Recalling
@@ -62,18 +59,17 @@ class Nearest(Recalling):
         return found
 
 
-def save_nearest(model: HASM, episodes: Sequence[Episode], directory: Path) -> None:
+def save_nearest(model: HASM, directory: Path) -> None:
     """Write a model and the table that takes the place of its recall.
 
     Args:
         model: A model of displacements.
-        episodes: What it learned.
         directory: Where both go.
     """
     settled, body = model.settled, model.body
     assert settled is not None
     assert isinstance(model.recalling, Recalling)
-    samples = collect(model.config, body, settled, episodes).samples
+    samples = model.lessons.samples
     values = recalled_values(body, settled, samples)[0].double().numpy()
     joints = samples.positions[:, settled.joints] / _scale(body, settled.joints)
     part = model.recalling.code.parts.numpy()[samples.patch]
@@ -113,6 +109,6 @@ def _left_out(
     return error
 
 
-def _scale(body: Body, joints: Sequence[int]) -> Array:
+def _scale(body: Body, joints: list[int]) -> Array:
     """Range of each joint, rad or m."""
     return np.array([body.upper[j] - body.lower[j] for j in joints])

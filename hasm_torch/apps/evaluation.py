@@ -11,7 +11,7 @@ import torch
 from hasm_torch.apps.command_line import parse_options
 from hasm_torch.apps.teach import teach
 from hasm_torch.evaluation.evaluate import evaluate
-from hasm_torch.evaluation.open_loop import OpenLoopConfig, open_loop
+from hasm_torch.evaluation.open_loop import open_loop
 from hasm_torch.evaluation.options import EvalConfig
 
 
@@ -20,7 +20,7 @@ def main() -> None:
     config = parse_options(EvalConfig)
     try:
         if config.mode == "open_loop":
-            open_loop(OpenLoopConfig.of(config))
+            open_loop(config)
         else:
             roll_out(config)
     except (OSError, ValueError) as error:

@@ -179,56 +179,48 @@ def _from_arrays(config: RecordConfig, fps: int) -> Iterator[Recorded]:
     if config.arrays is None or not config.arrays.is_file():
         raise FileNotFoundError(f"no file {config.arrays}: expected an .npz with state (T, joints)")
     with np.load(config.arrays) as arrays:
-        series = dict(arrays)
+        series = dict(sorted(arrays.items()))
     known = ("state", "action", "tactile", "episode")
-    further = sorted(set(series) - set(known))
-    if "state" not in series or not all(name.startswith(PREFIX) for name in further):
+    strange = [name for name in series if name not in known and not name.startswith(PREFIX)]
+    if "state" not in series or strange:
         raise ValueError(
             f"{config.arrays} holds {sorted(series)}, expected state and what there is of "
             f"{', '.join(known[1:])}, {PREFIX}<name>"
         )
-    state = series["state"]
     lengths = {name: len(values) for name, values in series.items()}
     if len(set(lengths.values())) != 1:
         raise ValueError(f"{config.arrays}: arrays of different lengths, {lengths}")
-    labels = series.get("episode", np.zeros(len(state), dtype=int))
-    starts = np.flatnonzero(np.r_[True, labels[1:] != labels[:-1]])
-    for number, (start, stop) in enumerate(zip(starts, np.r_[starts[1:], len(labels)])):
-        rows = slice(start, stop)
-        action = series["action"][rows] if "action" in series else _next(state[rows])
-        tactile = _cells(config, series["tactile"][rows]) if "tactile" in series else None
-        observations = {name: series[name][rows] for name in further}
-        yield _episode(config, number, state[rows], action, tactile, observations, fps)
+    labels = series.pop("episode", np.zeros(len(series["state"]), dtype=int))
+    borders = np.flatnonzero(np.diff(labels)) + 1
+    for number, rows in enumerate(np.split(np.arange(len(labels)), borders)):
+        columns = {name: values[rows] for name, values in series.items()}
+        yield _episode(config, number, columns, fps)
 
 
 def _from_env(config: RecordConfig, env: Any, fps: int) -> Iterator[Recorded]:
     controller, source = _controller(config.env), config.env
-    named = [("state", source.state), *(("observations", key) for key in source.observations)]
+    named = [("state", source.state, "state")]
     if source.tactile:
-        named.append(("tactile", source.tactile))
+        named.append(("tactile", source.tactile, "tactile"))
+    named += [("observations", key, PREFIX + key) for key in source.observations]
     for number in range(config.episodes):
         observation, info = env.reset(seed=config.seed + number)
-        rows: list[tuple[Any, Any, Any, Any]] = []
+        rows: list[dict[str, Array]] = []
         over = False
         while not over and len(rows) < config.max_steps:
-            for option, key in named:
+            for option, key, _ in named:
                 if key not in observation:
                     raise ValueError(
-                        f"{config.env.id} observes {sorted(observation)}, not {key!r}: give "
+                        f"{source.id} observes {sorted(observation)}, not {key!r}: give "
                         f"--env.{option}"
                     )
             action = np.asarray(controller(observation, info), dtype=np.float32)
-            skin = observation[config.env.tactile] if config.env.tactile else None
-            seen = [np.array(observation[key]) for key in config.env.observations]
-            rows.append((observation[config.env.state], action, skin, seen))
+            row = {column: np.array(observation[key]) for _, key, column in named}
+            rows.append(row | {"action": action})
             observation, _, terminated, truncated, info = env.step(action)
             over = terminated or truncated
-        states, actions, skins, others = zip(*rows)
-        tactile = _cells(config, np.array(skins)) if config.env.tactile else None
-        names = (PREFIX + key for key in config.env.observations)
-        observations = {name: np.stack(values) for name, values in zip(names, zip(*others))}
-        state, action = np.array(states), np.array(actions)
-        yield _episode(config, number, state, action, tactile, observations, fps)
+        columns = {column: np.stack([row[column] for row in rows]) for column in rows[0]}
+        yield _episode(config, number, columns, fps)
 
 
 def _controller(source: EnvSource) -> Controller:
@@ -242,35 +234,24 @@ def _controller(source: EnvSource) -> Controller:
     return getattr(import_module(module), name)
 
 
-def _next(state: Array) -> Array:
-    """The next state of every sample; the last one stays."""
-    return np.concatenate([state[1:], state[-1:]])
-
-
-def _cells(config: RecordConfig, tactile: Array) -> Array:
-    if tactile.ndim == 3:
-        return tactile
-    if tactile.ndim != 2 or tactile.shape[1] % config.channels:
-        raise ValueError(
-            f"expected tactile (T, cells, channels), or flat with {config.channels} channels a "
-            f"cell (--channels), got {tactile.shape}"
-        )
-    return tactile.reshape(len(tactile), -1, config.channels)
-
-
-def _episode(
-    config: RecordConfig,
-    number: int,
-    state: Array,
-    action: Array,
-    tactile: Array | None,
-    observations: dict[str, Array],
-    fps: int,
-) -> Recorded:
+def _episode(config: RecordConfig, number: int, columns: dict[str, Array], fps: int) -> Recorded:
+    state, tactile = columns["state"], columns.get("tactile")
+    action = columns.get("action", np.concatenate([state[1:], state[-1:]]))  # the next state
+    if tactile is not None and tactile.ndim != 3:
+        if tactile.ndim != 2 or tactile.shape[1] % config.channels:
+            raise ValueError(
+                f"expected tactile (T, cells, channels), or flat with {config.channels} channels a "
+                f"cell (--channels), got {tactile.shape}"
+            )
+        tactile = tactile.reshape(len(tactile), -1, config.channels)
+    further = {
+        name: values.reshape(len(state), -1)
+        for name, values in columns.items()
+        if name.startswith(PREFIX)
+    }
+    bound = np.concatenate(list(further.values()), axis=1) if further else None
     time = np.arange(len(state)) / fps
-    flat = [values.reshape(len(state), -1) for values in observations.values()]
-    sizes = {name: values.shape[1] for name, values in zip(observations, flat)}
-    bound = np.concatenate(flat, axis=1) if flat else None
+    sizes = {name: values.shape[1] for name, values in further.items()}
     return Episode(number, config.task, time, state, action, tactile, bound), sizes
 
 

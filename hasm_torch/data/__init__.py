@@ -8,11 +8,8 @@ from hasm_torch.data.card import write_card
 from hasm_torch.data.episodes import (
     Episode,
     EpisodeSet,
-    EpisodeStream,
     FeatureMap,
     load_episodes,
-    open_episodes,
-    windows,
 )
 from hasm_torch.data.recording import write_episodes
 from hasm_torch.data.skin import SkinPatch, skin_patches
@@ -20,13 +17,10 @@ from hasm_torch.data.skin import SkinPatch, skin_patches
 __all__ = [
     "Episode",
     "EpisodeSet",
-    "EpisodeStream",
     "FeatureMap",
     "SkinPatch",
     "load_episodes",
-    "open_episodes",
     "skin_patches",
-    "windows",
     "write_card",
     "write_episodes",
 ]

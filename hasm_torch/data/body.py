@@ -11,15 +11,13 @@ import numpy as np
 
 from hasm_torch._assets import asset_path
 from hasm_torch.body import Body
-from hasm_torch.data.episodes import EpisodeSet, EpisodeStream
+from hasm_torch.data.episodes import EpisodeSet
 from hasm_torch.data.skin import SkinPatch
 from hasm_torch.encoders.readings import PUSHES, WRENCH
 from hasm_torch.episode import Episode
 from hasm_torch.robot.kinematics import Kinematics
 from hasm_torch.robot.turns import link_turns, planar_base, rigid_body
 from hasm_torch.robot.urdf import UrdfJoint, read_urdf
-
-Dataset = EpisodeSet | EpisodeStream
 
 # A position beyond its limits by more than this share of the range is worth a warning; by more
 # than FAR it is another unit or another joint.
@@ -39,7 +37,7 @@ class Limits(NamedTuple):
     max_speed: list[float]
 
 
-def body_of(data: Dataset, urdf: Path | None = None) -> Body:
+def body_of(data: EpisodeSet, urdf: Path | None = None) -> Body:
     """Joints and skin of a dataset.
 
     Args:
@@ -101,7 +99,7 @@ def _jointed(body: Body, urdf: Path) -> Body:
     )
 
 
-def describe_body(data: Dataset, body: Body, urdf: Path | None = None) -> list[str]:
+def describe_body(data: EpisodeSet, body: Body, urdf: Path | None = None) -> list[str]:
     """Where limits and touch of ``body_of`` come from, a line each, for people."""
     lines = [f"joint limits: {_urdf_of(data, urdf) or FROM_DATA}"]
     if body.base:
@@ -119,7 +117,7 @@ def describe_body(data: Dataset, body: Body, urdf: Path | None = None) -> list[s
     return lines
 
 
-def limits_of(data: Dataset, urdf: Path | None = None) -> Limits:
+def limits_of(data: EpisodeSet, urdf: Path | None = None) -> Limits:
     """Joint limits of a dataset; arguments and errors as in ``body_of``."""
     chosen = _urdf_of(data, urdf)
     if chosen is None:
@@ -138,28 +136,28 @@ def limits_of(data: Dataset, urdf: Path | None = None) -> Limits:
     return Limits(lower.tolist(), upper.tolist(), speed.tolist())
 
 
-def _urdf_of(data: Dataset, urdf: Path | None) -> Path | None:
+def _urdf_of(data: EpisodeSet, urdf: Path | None) -> Path | None:
     """The URDF by option, else the bundled one where it has the dataset's joints, else none."""
     bundled = asset_path("hsr.urdf")
     known = urdf is None and set(data.joints) <= set(read_urdf(bundled).joints)
     return bundled if known else urdf
 
 
-def _urdf_joints(data: Dataset, urdf: Path) -> list[UrdfJoint]:
+def _urdf_joints(data: EpisodeSet, urdf: Path) -> list[UrdfJoint]:
     if not urdf.is_file():
         raise FileNotFoundError(f"no URDF at {urdf}: check --robot.urdf")
-    joints = read_urdf(urdf).joints
+    joints = {j.name: j for j in read_urdf(urdf).joints.values() if j.type != "fixed"}
     missing = [name for name in data.joints if name not in joints]
     if missing:
         raise ValueError(
-            f"{urdf} has no joint {', '.join(missing)} of dataset {data.root}; its joints: "
+            f"{urdf} has no moving joint {', '.join(missing)} of dataset {data.root}; its joints: "
             f"{', '.join(joints)}. Name the dataset's joints as the URDF does, or leave the URDF "
             "out: the limits are then the range of the data"
         )
     return [joints[name] for name in data.joints]
 
 
-def _check_units(data: Dataset, joints: Iterable[UrdfJoint], urdf: Path) -> None:
+def _check_units(data: EpisodeSet, joints: Iterable[UrdfJoint], urdf: Path) -> None:
     for joint, unit in zip(joints, data.units):
         if joint.type == "revolute" and unit.lower() in DEGREES:
             raise ValueError(
@@ -170,7 +168,7 @@ def _check_units(data: Dataset, joints: Iterable[UrdfJoint], urdf: Path) -> None
 
 
 def _check_positions(
-    data: Dataset, joints: list[UrdfJoint], lower: np.ndarray, upper: np.ndarray, urdf: Path
+    data: EpisodeSet, joints: list[UrdfJoint], lower: np.ndarray, upper: np.ndarray, urdf: Path
 ) -> None:
     span = np.where(np.isfinite(upper), upper - lower, 1.0)
     worst = np.full(len(joints), BEYOND)
@@ -200,7 +198,7 @@ def _check_positions(
         warnings.warn(f"{where}; it is taken as the limit", stacklevel=4)
 
 
-def _check_speeds(data: Dataset, joints: list[UrdfJoint], urdf: Path) -> None:
+def _check_speeds(data: EpisodeSet, joints: list[UrdfJoint], urdf: Path) -> None:
     limit = np.array([joint.velocity for joint in joints])
     for episode in data:
         if len(episode) < 2:
@@ -219,7 +217,7 @@ def _check_speeds(data: Dataset, joints: list[UrdfJoint], urdf: Path) -> None:
             return
 
 
-def _range(data: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _range(data: EpisodeSet) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Least and greatest position and greatest speed of each joint, over states and targets."""
     joints = len(data.joints)
     lower, upper = np.full(joints, np.inf), np.full(joints, -np.inf)

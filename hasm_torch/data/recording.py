@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hasm_torch.data.checks import check_finite
 from hasm_torch.data.skin import UNKNOWN_UNIT, SkinPatch, skin_to_info
 from hasm_torch.episode import ACTION, STATE, TACTILE, Episode
 
@@ -203,12 +204,7 @@ def _column(values: np.ndarray, shape: tuple[int, ...], key: str, number: int) -
         )
     with np.errstate(over="ignore"):  # what float32 cannot hold is reported below
         column = np.ascontiguousarray(values, dtype=np.float32)
-    bad = np.argwhere(~np.isfinite(column))
-    if bad.size:
-        raise ValueError(
-            f"Episode {number}: expected finite numbers in {key!r}, got "
-            f"{column[tuple(bad[0])]} in frame {bad[0][0]}."
-        )
+    check_finite(column, key, number)
     return column
 
 

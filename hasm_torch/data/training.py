@@ -10,12 +10,13 @@ import numpy as np
 from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig
 from hasm_torch.data.body import body_of, describe_body
-from hasm_torch.data.episodes import FeatureMap, open_episodes
+from hasm_torch.data.episodes import FeatureMap, load_episodes
 from hasm_torch.episode import Episode
 from hasm_torch.model.fit import FitReport
 from hasm_torch.model.hasm import HASM
 
 Method = Literal["default", "literal"]
+MOST_BYTES = 1 << 30  # of a dataset that is held in memory; a larger one is read as it is learned
 
 
 @dataclass
@@ -104,7 +105,7 @@ def train(
     warm_up()
     begin = time.perf_counter()
     names = features or FeatureMap()
-    data = open_episodes(root, names)
+    data = load_episodes(root, names, most_bytes=MOST_BYTES)
     body = body_of(data, urdf)
     if len(data.action_names) != len(body.joints):
         raise ValueError(

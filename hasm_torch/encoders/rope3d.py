@@ -11,15 +11,9 @@ every block. Were each block turned about itself, as one sentence of the paper c
 would move, since n x n = 0. Where d is no multiple of 3 the last one or two entries stay as they
 are, so norms are kept exactly.
 
-What is continuous. rope3d is smooth in x and in the angle, and in the axis away from zero; a zero
-axis means no rotation, whatever the angle, and is a jump where the angle is not zero.
-touch_rotation is continuous, as a rotation, at every direction but the one opposite to the
-reference. There it cannot be: the axes of neighbouring directions point all ways round, and turns
-by w_i pi about different axes differ. Opposite directions, and those too close to tell apart in
-the dtype, share one fixed axis; a reference that no touch opposes avoids the jump.
+It is smooth in x and in the angle, and in the axis away from zero; a zero axis means no rotation,
+whatever the angle, and is a jump where the angle is not zero.
 """
-
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -64,47 +58,6 @@ def rope3d(x: Tensor, axis: Tensor, angle: Tensor) -> Tensor:
     turned = (vectors + sine * first + versine * second).flatten(-2)
     tail = code[..., 3 * blocks :].expand(*shape, dim - 3 * blocks)
     return torch.cat((turned, tail), -1).to(x.dtype if x.is_floating_point() else dtype)
-
-
-def touch_rotation(
-    direction: Tensor, reference: Tensor | Sequence[float] = (0.0, 0.0, 1.0)
-) -> tuple[Tensor, Tensor]:
-    """The smallest rotation that takes `reference` to the direction of a touch.
-
-    Axis (r x t) / |r x t|, angle atan2(|r x t|, r . t) of the unit vectors r and t.
-
-    Args:
-        direction: (..., 3), of any length. A zero direction, no touch, gives the angle 0.
-        reference: (3,) or (..., 3), not zero.
-
-    Returns:
-        axis (..., 3), of length 1, and angle (...), rad in [0, pi], in the dtype of `direction`
-        or float32 where that is coarser. Values and gradients are finite everywhere. At the
-        reference itself and opposite to it (r x t shorter than the square root of the dtype's
-        resolution) the axis is one fixed perpendicular of the reference.
-
-    Raises:
-        ValueError: if either has no three components.
-    """
-    dtype = torch.promote_types(direction.dtype, torch.float32)
-    start = torch.as_tensor(reference, dtype=dtype, device=direction.device)
-    for name, vector in (("direction", direction), ("reference", start)):
-        if vector.ndim == 0 or vector.shape[-1] != 3:
-            raise ValueError(f"expected a {name} of shape (..., 3), got {tuple(vector.shape)}")
-    target, start = torch.broadcast_tensors(_unit(direction.to(dtype)), _unit(start))
-    normal = torch.linalg.cross(start, target)
-    cosine = (start * target).sum(-1)
-    nearest_zero = torch.where(cosine < 0, torch.finfo(dtype).eps ** 0.5, 0.0)
-    unclear = normal.detach().norm(dim=-1) <= nearest_zero
-
-    # perpendicular through the coordinate axis farthest from the reference
-    basis = torch.eye(3, dtype=dtype, device=start.device)
-    farthest = basis[start.abs().argmin(-1)]
-    fallback = _unit(torch.linalg.cross(start, farthest))
-    axis = torch.where(unclear.unsqueeze(-1), fallback, _unit(normal))
-    sine = (normal * axis).sum(-1).abs()  # |r x t|, with a finite gradient where it is zero
-    cosine = torch.where((direction != 0).any(-1), cosine, 1.0)  # atan2(0, 0) has no gradient
-    return axis, torch.atan2(sine, cosine)
 
 
 class RoPE3D(nn.Module):

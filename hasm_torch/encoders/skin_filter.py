@@ -2,7 +2,9 @@
 
     lost samples ──hold──► noise, offset, stuck cells ──reject──► dead cells ──impute──► forces
 
-A clean reading passes unchanged, to the last bit. r_c is the L1 norm of a cell's three forces.
+A sound reading passes unchanged to the last bit, with two exceptions: a touch ends ``HOLD_S``
+later, and cells that a touch at the border of a patch leaves out may be taken for dead. r_c is the
+L1 norm of a cell's three forces; a sample takes some 0.4 ms.
 
 * **Lost sample.** A sample in which every cell reads exactly zero right after a touch repeats the
   last one, for at most ``HOLD_S``; a touch that ends does so that much later.
@@ -23,19 +25,22 @@ A clean reading passes unchanged, to the last bit. r_c is the L1 norm of a cell'
   dead: their share is then put back, from the median over the other cells of reading / share.
 """
 
-import functools
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hasm_torch.encoders.readings import patch_borders
-from hasm_torch.kernels.compiling import compile_kernel
+from hasm_torch.body import Body
+from hasm_torch.encoders.readings import FORCES, forces_of, patch_borders
+from hasm_torch.episode import Episode
 
+Array = NDArray[np.float32]
+
+RULES = ("lost", "noise", "offset", "stuck", "dead")  # each named after the fault that it meets
 HOLD_S = 0.06
 WINDOW = 5  # samples over which a cell's reading is averaged to tell it from noise
 LONG_WINDOW = 25  # samples over which the levels of noise and offset are taken
@@ -57,205 +62,169 @@ class FilterState:
 
     Attributes:
         last: (cells, 3) last sample that was not lost, N.
-        missed: Samples lost since.
-        seen: Samples so far.
-        readings: (LONG_WINDOW, cells) last readings, the newest at ``(seen − 1) % LONG_WINDOW``, N.
-        changes: (LONG_WINDOW,) last medians of the second differences, N.
         stuck: (cells,) what a cell has read since the first sample that may be stuck, N; else 0.
+        readings: (up to LONG_WINDOW, cells) last readings, N.
+        changes: Up to LONG_WINDOW last medians of the second differences, N.
+        missed: Samples lost since the last one that was not.
+        seen: Samples so far.
         stirred: Samples in which a cell that may not be stuck read something new.
     """
 
-    last: NDArray[np.float32]
-    missed: int
-    seen: int
-    readings: NDArray[np.float32]
-    changes: NDArray[np.float32]
-    stuck: NDArray[np.float32]
-    stirred: int
-
-    @classmethod
-    def start(cls, cells: int) -> "FilterState":
-        """Before the first sample."""
-        return cls(
-            np.zeros((cells, 3), np.float32),
-            0,
-            0,
-            np.zeros((LONG_WINDOW, cells), np.float32),
-            np.zeros(LONG_WINDOW, np.float32),
-            np.zeros(cells, np.float32),
-            0,
-        )
+    last: Array
+    stuck: Array
+    readings: Array
+    changes: list[float] = field(default_factory=list)
+    missed: int = 0
+    seen: int = 0
+    stirred: int = 0
 
 
-def clean_skin(
-    skin: Tensor,
-    cells: list[int],
-    rate: float,
-    footprint: NDArray[np.float32],
-    state: FilterState | None = None,
-) -> tuple[Tensor, FilterState]:
-    """Clean a stream of skin samples; a chunked stream equals a whole one.
+@dataclass(frozen=True, eq=False)
+class SkinFilter:
+    """The filter of one skin.
 
-    Args:
-        skin: (T, C, 3) forces of all cells, N.
+    Attributes:
         cells: Number of cells of each patch; C in all.
         rate: Sampling rate, Hz.
         footprint: (C,) share of its patch's force that a cell takes at every touch, 0 where a
-            touch may leave it out; see ``Footprint``.
-        state: What an earlier chunk returned; it is used up.
-
-    Returns:
-        (T, C, 3) forces, N, on the device of ``skin``; the state to go on from.
-
-    Raises:
-        ValueError: If a shape does not fit.
-    """
-    total = sum(cells)
-    if skin.ndim != 3 or skin.shape[1:] != (total, 3) or footprint.shape != (total,):
-        raise ValueError(
-            f"expected skin (T, {total}, 3) and footprint ({total},), got {tuple(skin.shape)} and "
-            f"{footprint.shape}"
-        )
-    state = FilterState.start(total) if state is None else state
-    cleaned = skin.detach().float().cpu().numpy().copy()
-    borders = patch_borders(tuple(cells))
-    state.missed, state.seen, state.stirred = _compiled()(
-        cleaned, borders, footprint, round(HOLD_S * rate), round(PROBATION_S * rate), state.last,
-        state.missed, state.seen, state.readings, state.changes, state.stuck, state.stirred,
-    )  # fmt: skip
-    return torch.from_numpy(cleaned).to(skin.device), state
-
-
-class Footprint:
-    """Share of its patch's force that each cell takes at every touch, over some episodes.
-
-    Args:
-        cells: Number of cells of each patch.
+            touch may leave it out.
+        without: Those of ``RULES`` that are left out.
     """
 
-    def __init__(self, cells: list[int]) -> None:
-        self._borders = patch_borders(tuple(cells))
-        self._total: NDArray[np.float64] = np.zeros(sum(cells))
-        self._touches = np.zeros(sum(cells), np.int64)
-        self._always = np.ones(sum(cells), np.bool_)
+    cells: Sequence[int]
+    rate: float
+    footprint: Array
+    without: Sequence[str] = ()
 
-    def add(self, skin: Tensor) -> None:
-        """Take in an episode.
+    def __post_init__(self) -> None:
+        if self.footprint.shape != (sum(self.cells),):
+            raise ValueError(
+                f"expected a footprint ({sum(self.cells)},), got {self.footprint.shape}"
+            )
+        if unknown := set(self.without) - set(RULES):
+            raise ValueError(f"unknown rules {sorted(unknown)}, valid: {', '.join(RULES)}")
+
+    @classmethod
+    def learn(
+        cls, body: Body, episodes: Iterable[Episode], without: Sequence[str] = ()
+    ) -> "SkinFilter":
+        """The filter of a robot, with the mean shares of the touches of some episodes.
+
+        Args:
+            body: The robot.
+            episodes: Its episodes, of a sound skin.
+            without: Those of ``RULES`` that are left out.
+        """
+        borders = patch_borders(tuple(body.cells))
+        total: NDArray[np.float64] = np.zeros(borders[-1])
+        touches, always = np.zeros(borders[-1], np.int64), np.ones(borders[-1], np.bool_)
+        for episode in episodes:
+            skin = None if episode.tactile is None else torch.from_numpy(episode.tactile)
+            readings = forces_of(body, skin, (len(episode),)).abs().sum(-1).double().numpy()
+            for patch in map(slice, borders[:-1], borders[1:]):
+                force = readings[:, patch].sum(1)
+                touched = readings[force >= TOUCHED, patch]
+                total[patch] += (touched / force[force >= TOUCHED, None]).sum(0)
+                touches[patch] += len(touched)
+                always[patch] &= (touched > SILENT).all(0)
+        shares = np.where(always, total / np.maximum(touches, 1), 0.0)
+        return cls(body.cells, body.rate, shares.astype(np.float32), without)
+
+    @property
+    def _patches(self) -> list[slice]:
+        borders = patch_borders(tuple(self.cells)).tolist()
+        return [slice(*ends) for ends in pairwise(borders)]
+
+    def __call__(
+        self, skin: Tensor, state: FilterState | None = None
+    ) -> tuple[Tensor, FilterState]:
+        """Clean a stream of skin samples; a chunked stream equals a whole one.
 
         Args:
             skin: (T, C, 3) forces of all cells, N.
+            state: What an earlier chunk returned; it is used up.
+
+        Returns:
+            (T, C, 3) forces, N, on the device of ``skin``; the state to go on from.
+
+        Raises:
+            ValueError: If the shape does not fit.
         """
-        readings = skin.abs().sum(-1).double().cpu().numpy()
-        for first, end in zip(self._borders[:-1], self._borders[1:]):
-            force = readings[:, first:end].sum(1)
-            touched = readings[force >= TOUCHED, first:end]
-            self._total[first:end] += (touched / force[force >= TOUCHED, None]).sum(0)
-            self._touches[first:end] += len(touched)
-            self._always[first:end] &= (touched > SILENT).all(0)
+        total = len(self.footprint)
+        if skin.ndim != 3 or skin.shape[1:] != (total, FORCES):
+            raise ValueError(f"expected skin (T, {total}, 3), got {tuple(skin.shape)}")
+        if state is None:
+            nothing = np.zeros((total, FORCES), np.float32)
+            state = FilterState(nothing, nothing[:, 0].copy(), np.zeros((0, total), np.float32))
+        samples = skin.detach().float().cpu().numpy()
+        cleaned = np.zeros_like(samples)
+        for t, sample in enumerate(samples):
+            cleaned[t] = self._sample(sample.copy(), state)
+        return torch.from_numpy(cleaned).to(skin.device), state
 
-    def shares(self) -> Tensor:
-        """(C,) mean shares; 0 for a cell that was ever silent while its patch was touched."""
-        shares = np.where(self._always, self._total / np.maximum(self._touches, 1), 0.0)
-        return torch.from_numpy(shares).float()
+    def _sample(self, forces: Array, state: FilterState) -> Array:
+        """One sample (C, 3), which is used up; the state is brought up to date."""
+        state.missed = 0 if forces.any() else state.missed + 1
+        if not state.missed:
+            state.last = forces.copy()
+        elif state.missed <= round(HOLD_S * self.rate) and "lost" not in self.without:
+            forces = state.last.copy()
+        newest, earlier = np.abs(forces).sum(1), state.readings[-2:]
+        state.readings = np.vstack([state.readings, newest])[-LONG_WINDOW:]
+        self._watch(newest, earlier, state)
+        state.seen += 1
+        felt, doubt = self._felt(newest, earlier, state)
+        if state.seen <= round(PROBATION_S * self.rate) or state.stirred >= STIRRED:
+            felt[state.stuck > 0.0] = 0.0
+        read = newest > 0.0
+        forces[read] *= (felt[read] / newest[read])[:, None]
+        if "dead" not in self.without:
+            self._impute(forces, felt, max(SILENT, doubt))
+        return forces
 
+    def _watch(self, newest: Array, earlier: Array, state: FilterState) -> None:
+        """Which cells may be stuck, and whether others read something new."""
+        if not state.seen and "stuck" not in self.without:
+            for patch in self._patches:
+                spreads, pressed = self.footprint[patch] > 0.0, newest[patch] > SILENT
+                if pressed.sum() == 1 and spreads.sum() > 1 and spreads[pressed].all():
+                    state.stuck[patch][pressed] = newest[patch][pressed]
+        state.stuck[newest != state.stuck] = 0.0
+        if state.seen:
+            state.stirred += bool((newest != earlier[-1])[state.stuck == 0.0].any())
 
-@functools.cache
-def _compiled() -> Callable[..., tuple[int, int, int]]:
-    """The pass, compiled on first use and then cached on disk."""
+    def _felt(
+        self, newest: Array, earlier: Array, state: FilterState
+    ) -> tuple[NDArray[np.float64], float]:
+        """Readings (C,) less noise and common level, and the force that noise may feign, N."""
+        reading, compared = newest.astype(np.float64), len(self.cells) >= PATCHES_COMPARED
+        spread = float(np.median(np.abs(reading - np.median(reading)))) * _DEVIATION
+        noise = spread if compared else 0.0
+        if state.seen > 2:
+            change = np.abs(reading - 2.0 * earlier[1] + earlier[0])
+            state.changes = [*state.changes, float(np.median(change))][-LONG_WINDOW:]
+            noise = min(float(np.median(state.changes)) * _SECOND_DIFFERENCE, 2.0 * spread)
+        if "noise" in self.without:
+            noise = 0.0
+        level = 0.0
+        if compared and "offset" not in self.without:
+            means = state.readings.mean(0, dtype=np.float64)
+            level = min(float(np.median(means[patch])) for patch in self._patches)
+        doubt = REJECT * noise / min(state.seen, WINDOW) ** 0.5
+        if not level and not doubt:
+            return reading, doubt
+        clear = state.readings[-WINDOW:].mean(0, dtype=np.float64) - level > doubt
+        offset = max(level - RECTIFIED * noise, 0.0)
+        return np.where(clear, np.maximum(reading - offset, 0.0), 0.0), doubt
 
-    def kernel(
-        skin: Any, borders: Any, footprint: Any, hold: int, probation: int, last: Any, missed: int,
-        seen: int, readings: Any, changes: Any, stuck: Any, stirred: int,
-    ) -> tuple[int, int, int]:  # fmt: skip
-        samples, cells = skin.shape[:2]
-        reading, mean, change = np.empty(cells), np.empty(cells), np.empty(cells)
-        for t in range(samples):
-            lost = True
-            for c in range(cells):
-                for i in range(3):
-                    if skin[t, c, i] != 0.0:
-                        lost = False
-            missed = missed + 1 if lost else 0
-            if not lost:
-                last[:] = skin[t]
-            elif missed <= hold:
-                skin[t] = last
-
-            newest, before = seen % LONG_WINDOW, (seen - 1) % LONG_WINDOW
-            older = (seen - 2) % LONG_WINDOW
-            for c in range(cells):
-                reading[c] = abs(skin[t, c, 0]) + abs(skin[t, c, 1]) + abs(skin[t, c, 2])
-                readings[newest, c] = reading[c]
-                change[c] = abs(reading[c] - 2.0 * readings[before, c] + readings[older, c])
-            if seen == 0:
-                for p in range(len(borders) - 1):
-                    pressed, spreading, at = 0, 0, 0
-                    for c in range(borders[p], borders[p + 1]):
-                        spreading += footprint[c] > 0.0
-                        if reading[c] > SILENT:
-                            pressed, at = pressed + 1, c
-                    if pressed == 1 and spreading > 1 and footprint[at] > 0.0:
-                        stuck[at] = readings[newest, at]
-            news = False
-            for c in range(cells):
-                if readings[newest, c] != stuck[c]:
-                    stuck[c] = 0.0
-                if stuck[c] == 0.0 and seen and readings[newest, c] != readings[before, c]:
-                    news = True
-            stirred += news
-            seen += 1
-            known = min(seen, LONG_WINDOW)
-            compared = len(borders) > PATCHES_COMPARED
-            spread = np.median(np.abs(reading - np.median(reading))) * _DEVIATION
-            noise = spread if compared else 0.0
-            if seen > 2:
-                changes[(seen - 3) % LONG_WINDOW] = np.median(change)
-                noise = np.median(changes[: min(seen - 2, LONG_WINDOW)]) * _SECOND_DIFFERENCE
-                noise = min(noise, 2.0 * spread)
-
-            level: Any = 0.0
-            if compared:
-                level = np.inf
-                for c in range(cells):
-                    mean[c] = readings[:known, c].mean()
-                for p in range(len(borders) - 1):
-                    level = min(level, np.median(mean[borders[p] : borders[p + 1]]))
-            doubt = REJECT * noise / np.sqrt(min(seen, WINDOW))
-            offset = max(level - RECTIFIED * noise, 0.0)
-            if level > 0.0 or doubt > 0.0:
-                for c in range(cells):
-                    mean[c] = 0.0
-                    for i in range(min(seen, WINDOW)):
-                        mean[c] += readings[(seen - 1 - i) % LONG_WINDOW, c]
-                    mean[c] /= min(seen, WINDOW)
-                    felt = max(reading[c] - offset, 0.0) if mean[c] - level > doubt else 0.0
-                    scale = felt / reading[c] if reading[c] > 0.0 else 0.0
-                    for i in range(3):
-                        skin[t, c, i] *= scale
-                    reading[c] = felt
-
-            for c in range(cells):
-                if stuck[c] > 0.0 and (seen <= probation or stirred >= STIRRED):
-                    skin[t, c, :] = 0.0
-                    reading[c] = 0.0
-
-            silent = max(SILENT, doubt)
-            for p in range(len(borders) - 1):
-                first, end = borders[p], borders[p + 1]
-                alive = 0
-                for c in range(first, end):
-                    if footprint[c] > 0.0 and reading[c] > silent:
-                        change[alive] = reading[c] / footprint[c]
-                        alive += 1
-                if alive < 2:
-                    continue  # one cell alone does not tell how hard its patch is touched
-                ratios = np.sort(change[:alive])
-                force = ratios[(alive - 1) // 2]
-                for c in range(first, end):
-                    share = force * footprint[c]
-                    if reading[c] <= silent and share > CLEAR * silent:
-                        for i in range(3):
-                            skin[t, c, i] = share / 3.0
-        return missed, seen, stirred
-
-    return compile_kernel(kernel)
+    def _impute(self, forces: Array, felt: NDArray[np.float64], silent: float) -> None:
+        """Put the shares of dead cells back, in place."""
+        for patch in self._patches:
+            footprint, heard = self.footprint[patch], felt[patch] > silent
+            alive = heard & (footprint > 0.0)
+            if alive.sum() < 2:
+                continue  # one cell alone does not tell how hard its patch is touched
+            ratios = np.sort(felt[patch][alive] / footprint[alive])
+            share = ratios[(len(ratios) - 1) // 2] * footprint
+            dead = ~heard & (share > CLEAR * silent)
+            forces[patch][dead] = share[dead, None] / FORCES

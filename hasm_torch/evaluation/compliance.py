@@ -3,7 +3,7 @@
 Section "Pseudo-compliance Controller" of the paper.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from hasm_torch.evaluation import along_force
 from hasm_torch.evaluation.along_force import ALONG, motion
 from hasm_torch.evaluation.correlation import r_squared, spearman, tracking
 from hasm_torch.evaluation.push import Push, swelling
-from hasm_torch.evaluation.rollout import Array, Policy, Trace, limit_violations, roll_out
+from hasm_torch.evaluation.rollout import Array, Human, Trace, limit_violations, limits_of
 from hasm_torch.robot import JOINTS, Skin
 from hasm_torch.sim.tasks import (
     BEHAVIOURS,
@@ -44,6 +44,18 @@ class ComplianceCase:
     behaviour: int
     seed: int
     push: Push
+    place: tuple[float, float] = (0.0, 0.0)  # there is no object
+
+    def begin(self, sim: Any, start: Array | None) -> tuple[Push, Array]:
+        """The push and where the robot starts, see ``start_posture``."""
+        if start is None:
+            rng, behaviour = np.random.default_rng(self.seed), BEHAVIOURS[self.behaviour]
+            start = start_posture(behaviour, sim.joint_lower, sim.joint_upper, rng)
+        return self.push, start
+
+    def measure(self, trace: Trace, human: Human, sim: Any) -> dict[str, Any]:
+        """The figures of the rollout, see ``measure``."""
+        return measure(trace, BEHAVIOURS[self.behaviour], JOINTS, *limits_of(sim))
 
     @property
     def changing(self) -> bool:
@@ -94,37 +106,6 @@ def start_posture(
     return posture
 
 
-def run_case(
-    case: ComplianceCase,
-    env: Any,
-    policy: Policy,
-    watch: Callable[[], None] | None = None,
-    start: Array | None = None,
-) -> tuple[Trace, dict[str, Any]]:
-    """Roll one case out and measure it.
-
-    Args:
-        case: The case.
-        env: The "compliance" environment.
-        policy: The policy.
-        watch: Called after every step.
-        start: (joints,) start posture in place of the case's own, rad or m.
-
-    Returns:
-        The trace and its figures: ``motion`` of the touched point, ``displacement`` (rad, along
-        the wanted direction), ``force`` (N, mean), ``speed`` (rad/s, mean, signed along the wanted
-        direction), ``tracking`` (correlation of force and speed), ``drift`` (rad or m), ``others``
-        (largest motion of another joint, rad or m), ``violations``.
-    """
-    sim = env.unwrapped
-    behaviour = BEHAVIOURS[case.behaviour]
-    limits = (sim.joint_lower, sim.joint_upper)
-    if start is None:
-        start = start_posture(behaviour, *limits, np.random.default_rng(case.seed))
-    trace = roll_out(env, policy, case.push, start, case.seed, watch=watch)
-    return trace, measure(trace, behaviour, JOINTS, *limits, sim.joint_speed_limit)
-
-
 def measure(
     trace: Trace,
     behaviour: Behaviour,
@@ -133,7 +114,14 @@ def measure(
     upper: Array,
     max_speed: Array,
 ) -> dict[str, Any]:
-    """The figures of one compliance rollout; see ``run_case``."""
+    """The figures of one rollout.
+
+    Returns:
+        ``motion`` of the touched point, ``displacement`` (rad, along the wanted direction),
+        ``force`` (N, mean), ``speed`` (rad/s, mean, signed along the wanted direction),
+        ``tracking`` (correlation of force and speed), ``drift`` (rad or m), ``others`` (largest
+        motion of another joint, rad or m), ``violations``.
+    """
     index, strength = joints.index(behaviour.joint), trace.strength
     period = float(np.median(np.diff(trace.time)))
     position = trace.state[:, index] * behaviour.direction
@@ -172,7 +160,7 @@ def succeeded(figures: dict[str, Any]) -> bool:
     """Whether the right joint went the right way and the others stayed.
 
     Args:
-        figures: What ``run_case`` measured.
+        figures: What ``measure`` found.
     """
     return bool(figures["displacement"] > MOVED and figures["others"] < STAYED)
 
@@ -196,7 +184,7 @@ def summarise(
 
     Args:
         planned: The cases.
-        figures: What ``run_case`` measured for each.
+        figures: What ``measure`` found for each.
         teacher: What it measured of the demonstrator's law for those of ``led``.
 
     Returns:

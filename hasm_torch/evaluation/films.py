@@ -8,9 +8,9 @@ import numpy as np
 
 from hasm_torch.evaluation.compliance import ComplianceCase, even_push
 from hasm_torch.evaluation.grasp import GraspCase
-from hasm_torch.evaluation.push import swelling
-from hasm_torch.evaluation.rollout import Array, Human, Trace, roll_out
-from hasm_torch.evaluation.runner import make_env, run_case
+from hasm_torch.evaluation.push import Push, Pushes, swelling
+from hasm_torch.evaluation.rollout import Trace, roll_out, run_case
+from hasm_torch.evaluation.runner import make_env
 from hasm_torch.evaluation.video import Frame, caption, write_video
 from hasm_torch.model.hasm import HASM
 from hasm_torch.robot import Skin
@@ -27,29 +27,6 @@ FRAME_EVERY = 2  # control steps, so that videos run at half the control rate
 POSTURES = 3  # of the yield video
 PUSH_SECONDS, GAP_SECONDS = 1.2, 0.4
 FORCE, GRASP_FORCE = 8.0, 11.0  # N
-
-
-class Tour(Human):
-    """A human who pushes one patch after the other, each at one cell.
-
-    Args:
-        stops: Patch and cell of each push.
-    """
-
-    def __init__(self, stops: list[tuple[str, int]]) -> None:
-        self.stops = stops
-
-    def touches(self, time: float, state: Array) -> dict[str, tuple[float, int | None]]:
-        """The push that is on."""
-        number, into = divmod(time, PUSH_SECONDS + GAP_SECONDS)
-        if into < GAP_SECONDS or number >= len(self.stops):
-            return {}
-        patch, cell = self.stops[int(number)]
-        return {patch: (FORCE, cell)}
-
-    def finished(self, time: float, state: Array) -> bool:
-        """Some time after the last push."""
-        return time >= len(self.stops) * (PUSH_SECONDS + GAP_SECONDS) + GAP_SECONDS
 
 
 def film(experiment: str, model: HASM, seed: int, directory: Path) -> Path:
@@ -108,7 +85,7 @@ def _compliance(env: Any, model: HASM, seed: int) -> Iterator[list[Frame]]:
         push = swelling(even_push(behaviour, FORCE), np.random.default_rng(seed))
         camera = _Camera(env)
         case = ComplianceCase(index, seed, push)
-        trace, _ = run_case("compliance", case, env, model, camera, start)
+        trace, _ = run_case(case, env, model, camera, start)
         yield camera.clip(trace, "")
 
 
@@ -119,11 +96,15 @@ def _yield(env: Any, model: HASM, seed: int) -> Iterator[list[Frame]]:
         order = [*rng.permutation(WRIST_PATCHES)[:3], *rng.permutation(TORSO_PATCHES)[:2]]
         cells = [skin.slices[patch].stop - skin.slices[patch].start for patch in order]
         stops = [(str(patch), int(rng.integers(count))) for patch, count in zip(order, cells)]
-        # From wrist to torso and back, so that arm and base move in turn.
-        stops = [stops[i] for i in (0, 3, 1, 4, 2)]
+        pushes = []
+        for number, i in enumerate((0, 3, 1, 4, 2)):  # wrist and torso, so that both move in turn
+            patch, cell = stops[i]
+            begin = number * (PUSH_SECONDS + GAP_SECONDS) + GAP_SECONDS
+            end = begin + PUSH_SECONDS
+            pushes.append(Push({patch: (FORCE, cell)}, begin, end, rest=GAP_SECONDS))
         camera = _Camera(env)
         start = random_posture(*limits, rng)
-        trace = roll_out(env, model, Tour(stops), start, seed, watch=camera)
+        trace = roll_out(env, model, Pushes(pushes), start, seed, watch=camera)
         yield camera.clip(trace, f"posture {number + 1}   ")
 
 
@@ -131,5 +112,5 @@ def _grasp(env: Any, model: HASM, seed: int) -> Iterator[list[Frame]]:
     for side in (-FAR, FAR):
         camera = _Camera(env)
         case = GraspCase(seed, GRASP_FORCE, (side, side), pauses=1)
-        trace, _ = run_case("grasp", case, env, model, camera)
+        trace, _ = run_case(case, env, model, camera)
         yield camera.clip(trace, f"object {100 * side:+.0f} cm   ")

@@ -4,13 +4,13 @@ Section "Multi-joint Action Sequence" of the paper. What a touch does is named b
 not by the direction of the force, so ``along_force`` means nothing and is not measured.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from hasm_torch.evaluation.rollout import Array, Human, Policy, Trace, limit_violations, roll_out
+from hasm_torch.evaluation.rollout import Array, Human, Trace, limit_violations, limits_of
 from hasm_torch.sim.tasks import GRASP_PATCH, REACH_PATCH, START_NOISE, START_POSES, noisy_start
 
 FORCES = (3.0, 12.0)  # N, from which a touch is drawn
@@ -94,6 +94,39 @@ class GraspCase:
     pauses: int = PAUSES
     start_noise: float = START_NOISE
 
+    def begin(self, sim: Any, start: Array | None) -> tuple[Guide, Array]:
+        """The human and where the robot starts: near the usual posture, or another."""
+        rng = np.random.default_rng(self.seed)
+        guide = Guide(self.force, self.pauses, rng)
+        home = np.array(START_POSES["grasp"]) if start is None else start
+        limits = sim.joint_lower, sim.joint_upper
+        return guide, noisy_start(home, self.start_noise, *limits, rng)
+
+    def measure(self, trace: Trace, human: Human, sim: Any) -> dict[str, Any]:
+        """The figures of the rollout.
+
+        Returns:
+            ``success``, ``height`` (m above the table at the end), ``hold_drift`` (rad or m,
+            largest motion of a joint in a pause after its first 0.3 s), ``force`` (N), ``place``
+            (m), ``seconds``, ``violations``.
+        """
+        assert isinstance(human, Guide)
+        height = float(trace.height[-1])
+        drift = 0.0
+        for left, resumed in human.pauses:
+            held = (trace.time >= left + SETTLED_AFTER) & (trace.time <= resumed)
+            if held.any():
+                drift = max(drift, float(np.ptp(trace.state[held], axis=0).max()))
+        return {
+            "success": bool(trace.success and height >= LIFTED),
+            "height": height,
+            "hold_drift": drift,
+            "force": self.force,
+            "place": list(self.place),
+            "seconds": float(trace.time[-1]),
+            "violations": limit_violations(trace, *limits_of(sim)),
+        }
+
 
 def cases(
     rollouts: int,
@@ -121,52 +154,6 @@ def cases(
         case = GraspCase(int(rng.integers(2**31)), force, (x, y), pauses, start_noise)
         planned.append(case)
     return planned
-
-
-def run_case(
-    case: GraspCase,
-    env: Any,
-    policy: Policy,
-    watch: Callable[[], None] | None = None,
-    start: Array | None = None,
-) -> tuple[Trace, dict[str, Any]]:
-    """Roll one case out and measure it.
-
-    Args:
-        case: The case.
-        env: The "grasp" environment.
-        policy: The policy.
-        watch: Called after every step.
-        start: (joints,) start posture in place of the usual one, to which the case adds noise,
-            rad or m.
-
-    Returns:
-        The trace and its figures: ``success``, ``height`` (m above the table at the end),
-        ``hold_drift`` (rad or m, largest motion of a joint in a pause after its first 0.3 s),
-        ``force`` (N), ``place`` (m), ``seconds``, ``violations``.
-    """
-    sim = env.unwrapped
-    limits = (sim.joint_lower, sim.joint_upper)
-    rng = np.random.default_rng(case.seed)
-    guide = Guide(case.force, case.pauses, rng)
-    home = np.array(START_POSES["grasp"]) if start is None else start
-    begin = noisy_start(home, case.start_noise, *limits, rng)
-    trace = roll_out(env, policy, guide, begin, case.seed, case.place, watch)
-    height = float(trace.height[-1])
-    drift = 0.0
-    for left, resumed in guide.pauses:
-        held = (trace.time >= left + SETTLED_AFTER) & (trace.time <= resumed)
-        if held.any():
-            drift = max(drift, float(np.ptp(trace.state[held], axis=0).max()))
-    return trace, {
-        "success": bool(trace.success and height >= LIFTED),
-        "height": height,
-        "hold_drift": drift,
-        "force": case.force,
-        "place": list(case.place),
-        "seconds": float(trace.time[-1]),
-        "violations": limit_violations(trace, *limits, sim.joint_speed_limit),
-    }
 
 
 Figures = Sequence[dict[str, Any]]

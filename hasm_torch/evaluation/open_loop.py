@@ -12,27 +12,26 @@ in the dataset, so that degrees, radians and metres add up.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from hasm_torch.body import Body
-from hasm_torch.config import HASMConfig, write_json
+from hasm_torch.config import write_json
 from hasm_torch.data.body import body_of, describe_body
-from hasm_torch.data.episodes import EpisodeSet, FeatureMap, load_episodes
-from hasm_torch.data.training import DatasetConfig, Method, RobotConfig, settings
+from hasm_torch.data.episodes import EpisodeSet, load_episodes
+from hasm_torch.data.training import settings
+from hasm_torch.episode import Episode
 from hasm_torch.evaluation.opponents import tuned
-from hasm_torch.model.fit import timed_series
+from hasm_torch.evaluation.options import EvalConfig
+from hasm_torch.model.collect import collect
 from hasm_torch.model.hasm import HASM
-from hasm_torch.model.moments import moments
-
-if TYPE_CHECKING:
-    from hasm_torch.evaluation.options import EvalConfig
+from hasm_torch.model.moments import Series, moments
 
 Array = np.ndarray
 
@@ -40,42 +39,8 @@ CONTESTANTS = ("hasm", "ridge", "neighbours")
 
 # Joints and seconds that the plot shows.
 PLOT_JOINTS, PLOT_SECONDS = 6, 20.0
-
-
 # Frames of an episode that are predicted where touch moves the robot.
 STEPPED = 60
-
-
-@dataclass
-class OpenLoopConfig:
-    """Options of ``eval.py --mode=open_loop``.
-
-    Attributes:
-        dataset: Which dataset.
-        features: Which of its features are read.
-        robot: Which robot recorded it.
-        method: "default", with the settings under ``model``, or "literal", the paper as written.
-        model: Settings of the method; the horizon is that of the prediction.
-        folds: Parts into which the episodes are split; each is predicted by the others.
-        horizon_s: How far ahead, s, beside one frame ahead.
-        seed: Seed of the split.
-        output_dir: Where results go; by default ``outputs/open_loop/<time>``.
-    """
-
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    features: FeatureMap = field(default_factory=FeatureMap)
-    robot: RobotConfig = field(default_factory=RobotConfig)
-    method: Method = "default"
-    model: HASMConfig = field(default_factory=HASMConfig)
-    folds: int = 5
-    horizon_s: float = 0.5
-    seed: int = 0
-    output_dir: Path | None = None
-
-    @classmethod
-    def of(cls, options: "EvalConfig") -> "OpenLoopConfig":
-        """The options of ``eval.py`` that open-loop prediction takes."""
-        return cls(**{f.name: getattr(options, f.name) for f in fields(cls)})
 
 
 @dataclass
@@ -97,11 +62,11 @@ class Predicted:
     choices: dict[str, str]
 
 
-def open_loop(config: OpenLoopConfig) -> dict[str, Any]:
+def open_loop(config: EvalConfig) -> dict[str, Any]:
     """Run the evaluation; write ``open_loop.json`` and a plot, print a table.
 
     Args:
-        config: What to evaluate.
+        config: What to evaluate, of ``mode`` "open_loop".
 
     Returns:
         The content of ``open_loop.json``.
@@ -159,7 +124,7 @@ def fold_episodes(count: int, folds: int, generator: np.random.Generator) -> lis
 
 
 def predict_fold(
-    data: EpisodeSet, held_out: Sequence[int], horizon: int, config: OpenLoopConfig
+    data: EpisodeSet, held_out: Sequence[int], horizon: int, config: EvalConfig
 ) -> Predicted:
     """Predict some episodes from all others.
 
@@ -169,7 +134,7 @@ def predict_fold(
         data: The dataset.
         held_out: Numbers of the episodes to predict.
         horizon: Frames ahead.
-        config: Method, settings and URDF.
+        config: Method, settings and URDF; the horizon of its model is not used.
 
     Raises:
         ValueError: If the episodes are too short for the horizon.
@@ -185,8 +150,14 @@ def predict_fold(
     most = 10**9 if model.settled.drive == "time" else STEPPED
     mine, frames = zip(*(model.predict(episode, horizon, most) for episode in unseen))
     by = {"hasm": np.concatenate(mine)}
-    series = [timed_series(method, body, model.settled, e, i) for i, e in enumerate(learned)]
-    asked = [timed_series(method, body, model.settled, e, i) for i, e in enumerate(unseen)]
+    # The opponents get what a memory of a robot gets that time moves on, whatever moves this one.
+    timed = replace(model.settled, drive="time")
+
+    def series_of(episodes: Sequence[Episode]) -> list[Series]:
+        lessons = (collect(method, body, timed, e, i) for i, e in enumerate(episodes))
+        return [lesson.series for lesson in lessons if lesson.series is not None]
+
+    series, asked = series_of(learned), series_of(unseen)
     starts = np.cumsum([0, *(len(e) - horizon for e in unseen)])[:-1]
     rows = torch.from_numpy(np.concatenate([s + f for s, f in zip(starts, frames)]))
     for name, (past, predict) in tuned(series, horizon).items():
@@ -223,7 +194,7 @@ def _report(
     found: dict[str, list[Predicted]],
     horizons: dict[str, int],
     parts: list[list[int]],
-    config: OpenLoopConfig,
+    config: EvalConfig,
 ) -> dict[str, Any]:
     states = np.concatenate([episode.state for episode in data]).astype(np.float64)
     span = states.max(0) - states.min(0)

@@ -1,6 +1,5 @@
 """Figures of an evaluation, drawn with matplotlib."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
+from hasm_torch.evaluation.rollout import Trace
+from hasm_torch.robot import JOINTS
+
 Array = NDArray[np.float64]
 
 PATCH_COLOURS = {
@@ -22,40 +24,31 @@ PATCH_COLOURS = {
 }
 
 
-def plot_trajectory(
-    path: Path,
-    time: Array,
-    position: Array,
-    force: Array,
-    speed: Array,
-    patches: Sequence[str],
-    joint: str,
-) -> None:
+def plot_trajectory(path: Path, trace: Trace, joint: int) -> None:
     """Joint trajectory, force and joint speed over time, the touched patches shaded.
 
     Args:
         path: PNG to write.
-        time: (T,) s.
-        position: (T,) rad.
-        force: (T,) N.
-        speed: (T,) rad/s.
-        patches: (T,) patch touched, "" for none.
-        joint: Name of the joint.
+        trace: A rollout in which one finger touches.
+        joint: Index into ``JOINTS``.
     """
     figure, axes = plt.subplots(3, 1, sharex=True, figsize=(9, 6.5))
-    for axis, values, label in zip(
-        axes,
-        (position, force, speed),
-        (f"{joint}\nposition (rad)", "force on the skin\n(N)", "joint speed\n(rad/s)"),
-    ):
-        _shade(axis, time, patches)
-        axis.plot(time, values, color="black", linewidth=1.2)
+    series = {
+        f"{JOINTS[joint]}\nposition (rad)": trace.state[:, joint],
+        "force on the skin\n(N)": trace.strength,
+        "joint speed\n(rad/s)": trace.velocity[:, joint],
+    }
+    touched = trace.patch[:, 0]
+    for axis, (label, values) in zip(axes, series.items()):
+        for patch in dict.fromkeys(filter(None, touched.tolist())):
+            whole = {"transform": axis.get_xaxis_transform(), "linewidth": 0, "label": patch}
+            colour = PATCH_COLOURS[patch]
+            axis.fill_between(trace.time, 0, 1, touched == patch, color=colour, alpha=0.2, **whole)
+        axis.plot(trace.time, values, color="black", linewidth=1.2)
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     axes[-1].set_xlabel("time (s)")
-    handles, labels = axes[0].get_legend_handles_labels()
-    named = dict(zip(labels, handles))
-    axes[0].legend(named.values(), named.keys(), loc="best", title="touched patch")
+    axes[0].legend(loc="best", title="touched patch")
     axes[0].set_title("Pseudo-compliance: the joint yields to the touch, faster the harder it is")
     save(figure, path)
 
@@ -154,23 +147,6 @@ def plot_prediction(
     np.atleast_1d(axes)[0].legend(loc="best", fontsize=8)
     np.atleast_1d(axes)[-1].set_xlabel("time (s), held-out episodes one after the other")
     save(figure, path)
-
-
-def _shade(axis: Any, time: Array, patches: Sequence[str]) -> None:
-    start = 0
-    for i in range(1, len(patches) + 1):
-        if i == len(patches) or patches[i] != patches[start]:
-            patch = patches[start]
-            if patch:
-                axis.axvspan(
-                    time[start],
-                    time[min(i, len(time) - 1)],
-                    color=PATCH_COLOURS.get(patch, "grey"),
-                    alpha=0.2,
-                    label=patch,
-                    linewidth=0,
-                )
-            start = i
 
 
 def save(figure: Any, path: Path) -> None:

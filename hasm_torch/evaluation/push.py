@@ -52,6 +52,25 @@ class Push(Human):
         return time >= self.end + self.rest
 
 
+@dataclass(frozen=True)
+class Pushes(Human):
+    """One push after the other; the robot may rest between them.
+
+    Attributes:
+        pushes: The pushes in the order of time.
+    """
+
+    pushes: Sequence[Push]
+
+    def touches(self, time: float, state: Array) -> Mapping[str, tuple[float, int | None]]:
+        """What the push does that is on."""
+        return next(filter(None, (push.touches(time, state) for push in self.pushes)), {})
+
+    def finished(self, time: float, state: Array) -> bool:
+        """When the last push is over."""
+        return self.pushes[-1].finished(time, state)
+
+
 def swelling(push: Push, rng: np.random.Generator) -> Push:
     """A push of one finger whose force changes all the time instead of staying even."""
     [(patch, (_, cell))] = push.pressed.items()

@@ -125,6 +125,54 @@ def roll_out(
     return Trace.of(rows, success)
 
 
+class Case(Protocol):
+    """One rollout to be made: where it begins, what the human does, what is measured."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the environment."""
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """How far the object stands from its usual place, m."""
+
+    def begin(self, sim: Any, start: Array | None) -> tuple[Human, Array]:
+        """The human, and the start positions (joints,), rad or m; see ``run_case``."""
+
+    def measure(self, trace: Trace, human: Human, sim: Any) -> dict[str, Any]:
+        """The figures of the rollout."""
+
+
+def run_case(
+    case: Case,
+    env: Any,
+    policy: Policy,
+    watch: Callable[[], None] | None = None,
+    start: Array | None = None,
+) -> tuple[Trace, dict[str, Any]]:
+    """Roll one case out and measure it.
+
+    Args:
+        case: The case.
+        env: The environment of its experiment.
+        policy: The policy.
+        watch: Called after every step.
+        start: (joints,) start posture in place of the case's own (compliance, yield) or of the
+            usual one, to which the case adds noise (grasp), rad or m.
+
+    Returns:
+        The trace and its figures.
+    """
+    human, begin = case.begin(env.unwrapped, start)
+    trace = roll_out(env, policy, human, begin, case.seed, case.place, watch)
+    return trace, case.measure(trace, human, env.unwrapped)
+
+
+def limits_of(sim: Any) -> tuple[Array, Array, Array]:
+    """Lower, upper and speed limits of a ``HSRTouchEnv``, (joints,) each, rad or m and a second."""
+    return sim.joint_lower, sim.joint_upper, sim.joint_speed_limit
+
+
 def row_of(sim: Any, target: Array, info: Mapping[str, Any]) -> tuple[Any, ...]:
     """What a ``HSRTouchEnv`` shows after a control step, a row of a ``Trace``."""
     place = sim.object_position

@@ -10,21 +10,17 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
-from hasm_torch.evaluation import compliance, grasp, yielding
-from hasm_torch.evaluation.rollout import Array, Policy, Trace
+from hasm_torch.evaluation.rollout import Case, Policy, Trace, run_case
 from hasm_torch.model.hasm import HASM
 from hasm_torch.sim.teacher import ComplianceTeacher, GraspTeacher, YieldTeacher
 
 Rolled = tuple[Trace, dict[str, Any]]
-Case = compliance.ComplianceCase | yielding.YieldCase | grasp.GraspCase
-
-_MODULES: dict[str, Any] = {"compliance": compliance, "yield": yielding, "grasp": grasp}
 _TEACHERS: dict[str, Any] = {
     "compliance": ComplianceTeacher,
     "yield": YieldTeacher,
     "grasp": GraspTeacher,
 }
-EXPERIMENTS = tuple(_MODULES)
+EXPERIMENTS = tuple(_TEACHERS)
 MAX_STEPS = 10_000  # more than any human's patience
 
 # What a worker process has made so far: environments by scene, policies by name; and how.
@@ -77,32 +73,6 @@ class Runner:
         self._bar.close()
 
 
-def run_case(
-    experiment: str,
-    case: Case,
-    env: Any,
-    policy: Policy,
-    watch: Callable[[], None] | None = None,
-    start: Array | None = None,
-) -> Rolled:
-    """Roll one case out in this process.
-
-    Args:
-        experiment: One of ``EXPERIMENTS``.
-        case: The case.
-        env: The environment of the experiment.
-        policy: The policy.
-        watch: Called after every step.
-        start: (joints,) start posture in place of the case's own (compliance, yield) or of the
-            usual one, to which the case adds noise (grasp), rad or m.
-
-    Returns:
-        The trace and its figures.
-    """
-    rolled: Rolled = _MODULES[experiment].run_case(case, env, policy, watch, start)
-    return rolled
-
-
 def make_env(experiment: str, render: bool = False) -> Any:
     """The environment of an experiment."""
     import gymnasium
@@ -146,4 +116,4 @@ def _roll_out(experiment: str, case: Case, checkpoint: str | None) -> Rolled:
     if name not in _policies:
         made = make_teacher(experiment, env) if checkpoint is None else _loaders[0](checkpoint)
         _policies[name] = made
-    return run_case(experiment, case, env, _policies[name])
+    return run_case(case, env, _policies[name])

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from hasm_torch.data.episodes import load_episodes
 from hasm_torch.evaluation import plots, teaching, touch_plots, yielding
 from hasm_torch.evaluation.grasp import GraspCase
 from hasm_torch.evaluation.options import EvalConfig
-from hasm_torch.evaluation.rollout import Array, Human, roll_out
-from hasm_torch.evaluation.runner import make_env, run_case
+from hasm_torch.evaluation.push import Push, Pushes
+from hasm_torch.evaluation.rollout import Array, roll_out, run_case
+from hasm_torch.evaluation.runner import make_env
 from hasm_torch.evaluation.suite import MOVED
 from hasm_torch.evaluation.viewer import Scenes, cell_places, write_recording
 from hasm_torch.model.hasm import HASM
@@ -19,32 +19,22 @@ from hasm_torch.robot import JOINTS
 from hasm_torch.sim.tasks import FAR, GRASP_PATCH, OBJECT_PLACES, REACH_PATCH, START_POSES
 
 SHOWN_JOINT = "arm_flex_joint"
-# (begin s, end s, patch, lowest N, highest N): two pushes each way, the second pair harder.
-SCRIPT = (
-    (0.3, 1.8, "wrist_upper", 2.0, 6.0),
-    (2.3, 3.5, "wrist_upper", 4.0, 12.0),
-    (4.2, 5.7, "wrist_under", 2.0, 6.0),
-    (6.2, 7.4, "wrist_under", 4.0, 12.0),
+
+# Two swelling and fading pushes each way, the second pair harder: (s, s, patch, N, N).
+SCRIPT = Pushes(
+    [
+        Push({patch: (middle, None)}, begin, end, 0.6, swing, end - begin, phase=-np.pi / 2)
+        for begin, end, patch, middle, swing in (
+            (0.3, 1.8, "wrist_upper", 4.0, 2.0),
+            (2.3, 3.5, "wrist_upper", 8.0, 4.0),
+            (4.2, 5.7, "wrist_under", 4.0, 2.0),
+            (6.2, 7.4, "wrist_under", 8.0, 4.0),
+        )
+    ]
 )
 YIELD_VIEWS = 3
 LEAST_SHOWN = 6.0  # N, so that a way can be seen
 POSTURE_JOINTS = ("arm_flex_joint", "arm_roll_joint")
-
-
-class Script(Human):
-    """A human who follows ``SCRIPT``, each push swelling and fading."""
-
-    def touches(self, time: float, state: Array) -> dict[str, tuple[float, int | None]]:
-        """The push that is on."""
-        for begin, end, patch, low, high in SCRIPT:
-            if begin <= time < end:
-                swell = np.sin(np.pi * (time - begin) / (end - begin)) ** 2
-                return {patch: (low + (high - low) * float(swell), None)}
-        return {}
-
-    def finished(self, time: float, state: Array) -> bool:
-        """Some time after the last push."""
-        return time >= SCRIPT[-1][1] + 0.6
 
 
 def draw_compliance(
@@ -52,19 +42,10 @@ def draw_compliance(
 ) -> list[Path]:
     """The figure of the paper, and force against speed; see ``draw_yield``."""
     env = make_env("compliance")
-    trace = roll_out(env, model, Script(), np.array(START_POSES["compliance"]), seed=0)
+    trace = roll_out(env, model, SCRIPT, np.array(START_POSES["compliance"]), seed=0)
     env.close()
-    joint = JOINTS.index(SHOWN_JOINT)
     trajectory, force_speed = directory / "compliance.png", directory / "force_speed.png"
-    plots.plot_trajectory(
-        trajectory,
-        trace.time,
-        trace.state[:, joint],
-        trace.strength,
-        trace.velocity[:, joint],
-        trace.patch[:, 0].tolist(),
-        SHOWN_JOINT,
-    )
+    plots.plot_trajectory(trajectory, trace, JOINTS.index(SHOWN_JOINT))
     plots.plot_force_speed(force_speed, metrics["behaviours"])
     return [trajectory, force_speed]
 
@@ -94,17 +75,14 @@ def draw_yield(
     if "episodes" in metrics:
         paths.append(directory / "yield_episodes.png")
         touch_plots.plot_shares(paths[-1], {"memory": metrics["episodes"]})
-    if config.checkpoint is None:
-        episodes = load_episodes(config.datasets / "hsr_yield").episodes
-        episodes = teaching.wrist_and_torso(config.episodes)(episodes)
-        recalls = seen[0][1]
-        weights, reference = recalls[len(recalls) // 2]
-        joints = [JOINTS.index(joint) for joint in POSTURE_JOINTS]
-        postures = np.array([episodes[e].state[t, joints] for e, t, _ in model.origins])
-        paths.append(directory / "yield_recall.png")
-        touch_plots.plot_weights(
-            paths[-1], weights, model.origins, postures, reference[joints], POSTURE_JOINTS
-        )
+    recalls = seen[0][1]
+    weights, reference = recalls[len(recalls) // 2]
+    joints = [JOINTS.index(joint) for joint in POSTURE_JOINTS]
+    postures = np.array([model.posture(row)[joints] for row in range(len(weights))])
+    paths.append(directory / "yield_recall.png")
+    touch_plots.plot_weights(
+        paths[-1], weights, model.origins, postures, reference[joints], POSTURE_JOINTS
+    )
     return paths
 
 
@@ -115,7 +93,7 @@ def draw_grasp(
     env = make_env("grasp")
     recalled = _Recalled(model)
     case = GraspCase(config.seed, 7.0, (FAR / 2, -FAR / 2), pauses=2)
-    trace, _ = run_case("grasp", case, env, model, recalled)
+    trace, _ = run_case(case, env, model, recalled)
     env.close()
     paths = [directory / "recall_weights.png"]
     plots.plot_recall(paths[0], trace.time, recalled.weights, [REACH_PATCH, GRASP_PATCH])
@@ -155,12 +133,12 @@ def record(experiment: str, model: HASM, seed: int, directory: Path) -> Path:
 
     if experiment == "compliance":
         start = np.array(START_POSES[experiment])
-        trace = roll_out(env, model, Script(), start, seed, watch=watch)
+        trace = roll_out(env, model, SCRIPT, start, seed, watch=watch)
     elif experiment == "yield":
         [case] = yielding.cases(1, seed)
-        trace, _ = run_case(experiment, case, env, model, watch)
+        trace, _ = run_case(case, env, model, watch)
     else:
-        trace, _ = run_case(experiment, GraspCase(seed, 7.0, pauses=2), env, model, watch)
+        trace, _ = run_case(GraspCase(seed, 7.0, pauses=2), env, model, watch)
     env.close()
     joints, patches = list(JOINTS), list(model.body.patches)
     scenes = Scenes(
@@ -205,7 +183,7 @@ def _watched(
             for camera, taken in pictures.items():
                 taken.append(sim.render(camera))
 
-    trace, _ = run_case("yield", case.without_rest(), env, model, watch)
+    trace, _ = run_case(case.without_rest(), env, model, watch)
     both = {c: np.mean(taken, axis=0).astype(np.uint8) for c, taken in pictures.items() if taken}
     return touch_plots.View(trace, patch, both), recalls
 

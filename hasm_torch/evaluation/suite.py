@@ -6,7 +6,7 @@ from typing import Any
 
 from hasm_torch.evaluation import compliance, grasp, teaching, yielding
 from hasm_torch.evaluation.options import EvalConfig
-from hasm_torch.evaluation.runner import Case
+from hasm_torch.evaluation.rollout import Case
 from hasm_torch.sim.tasks import FAR, NEAR
 
 SIZES = (5, 10, 20, 40, 80)  # demonstrations at the wrist, of the curve

@@ -21,7 +21,7 @@ NEAR_PLACES = 9  # of the grasps, the first of tasks.OBJECT_PLACES; sixteen are 
 TOUCHED = 0.05  # N on a patch: less is noise
 SHORTEST = 5  # samples of an episode: a shorter rest of a cut one teaches nothing
 
-Choice = Callable[[list[Episode]], list[Episode]]
+Choice = Callable[[Sequence[Episode]], Sequence[Episode]]
 
 
 def learn(root: Path, config: HASMConfig, choice: Choice | None = None) -> HASM:
@@ -55,7 +55,7 @@ def wrist_and_torso(count: int, without: Sequence[str] = ()) -> Choice:
         What picks them. It raises ValueError where there are fewer.
     """
 
-    def choose(episodes: list[Episode]) -> list[Episode]:
+    def choose(episodes: Sequence[Episode]) -> Sequence[Episode]:
         torso = [e for e in episodes if e.task == YIELD_TORSO]
         wrist = [e for e in episodes if e.task != YIELD_TORSO]
         if len(wrist) < count:
@@ -69,12 +69,12 @@ def wrist_and_torso(count: int, without: Sequence[str] = ()) -> Choice:
     return choose
 
 
-def near_places(episodes: list[Episode]) -> list[Episode]:
+def near_places(episodes: Sequence[Episode]) -> Sequence[Episode]:
     """Grasps of the object at the nine places within 5 cm."""
     return episodes[:NEAR_PLACES]
 
 
-def far_places(episodes: list[Episode]) -> list[Episode]:
+def far_places(episodes: Sequence[Episode]) -> Sequence[Episode]:
     """Grasps of the object at the sixteen places within 10 cm."""
     return episodes[NEAR_PLACES:]
 

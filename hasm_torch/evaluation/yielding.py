@@ -1,6 +1,6 @@
 """Experiment 2, yield: the touched point moves along the force, wherever the robot is touched."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle, islice
 from typing import Any
@@ -11,7 +11,7 @@ from hasm_torch.evaluation import along_force
 from hasm_torch.evaluation.along_force import ALONG, motion
 from hasm_torch.evaluation.correlation import spearman
 from hasm_torch.evaluation.push import Push, swelling
-from hasm_torch.evaluation.rollout import Array, Policy, Trace, limit_violations, roll_out
+from hasm_torch.evaluation.rollout import Array, Human, Trace, limit_violations, limits_of
 from hasm_torch.robot import JOINTS, Skin
 from hasm_torch.sim.tasks import (
     ARM_JOINTS,
@@ -47,6 +47,17 @@ class YieldCase:
     seed: int
     kind: str
     push: Push
+    place: tuple[float, float] = (0.0, 0.0)  # there is no object
+
+    def begin(self, sim: Any, start: Array | None) -> tuple[Push, Array]:
+        """The push and where the robot starts, see ``start_posture``."""
+        if start is None:
+            start = start_posture(self, sim.joint_lower, sim.joint_upper)
+        return self.push, start
+
+    def measure(self, trace: Trace, human: Human, sim: Any) -> dict[str, Any]:
+        """The figures of the rollout, see ``measure``."""
+        return measure(trace, self, *limits_of(sim))
 
     def without_rest(self) -> "YieldCase":
         """The same case up to the release, which is all that is needed of most rollouts."""
@@ -115,33 +126,6 @@ def start_posture(case: YieldCase, lower: Array, upper: Array) -> Array:
     posture = random_posture(lower, upper, rng)
     posture[JOINTS.index("odom_t")] = rng.uniform(-np.pi, np.pi)
     return posture
-
-
-def run_case(
-    case: YieldCase,
-    env: Any,
-    policy: Policy,
-    watch: Callable[[], None] | None = None,
-    start: Array | None = None,
-) -> tuple[Trace, dict[str, Any]]:
-    """Roll one case out and measure it.
-
-    Args:
-        case: The case.
-        env: The "compliance" environment.
-        policy: The policy.
-        watch: Called after every step.
-        start: (joints,) start posture in place of the case's own, rad or m.
-
-    Returns:
-        The trace and its figures, see ``measure``.
-    """
-    sim = env.unwrapped
-    limits = (sim.joint_lower, sim.joint_upper)
-    if start is None:
-        start = start_posture(case, *limits)
-    trace = roll_out(env, policy, case.push, start, case.seed, watch=watch)
-    return trace, measure(trace, case, *limits, sim.joint_speed_limit)
 
 
 def measure(

@@ -36,27 +36,6 @@ class Crowding:
     beta: float
 
 
-def judged_rows(held: int, code_dim: int) -> Tensor:
-    """Evenly spread rows of a memory that are judged against all others, (J,).
-
-    Args:
-        held: Associations held.
-        code_dim: Length of their codes.
-    """
-    return torch.arange(0, held, max(1, math.ceil(held**2 * code_dim / LARGEST_WORK)))
-
-
-def fitting_beta(held: int, margin: float, confidence: float = 1e6) -> float:
-    """β at which the right association outweighs all others, see ``crowding``.
-
-    Args:
-        held: Different associations held, K.
-        margin: Smallest lead of one over the others, inner product.
-        confidence: Ratio of its weight to all others together.
-    """
-    return math.log(max(confidence * max(held - 1, 1), math.e)) / max(margin, 1e-6)
-
-
 def crowding(associations: Tensor, capacity: int, confidence: float = 1e6) -> Crowding:
     """Judge stored associations.
 
@@ -81,17 +60,16 @@ def crowding(associations: Tensor, capacity: int, confidence: float = 1e6) -> Cr
         raise ValueError("an empty memory has no margin: write at least one association first")
     if not confidence > 0:
         raise ValueError(f"confidence must be above 0, got {confidence}")
-    held = len(associations)
     stored = associations[_distinct(associations)].float()
-    own = (stored**2).sum(-1)
-    rows = judged_rows(*stored.shape).to(stored.device)
-    rival = torch.cat([_best_rival(stored, part) for part in rows.split(512)])
-    lead = own[rows] - rival
-    alone = len(stored) == 1
-    margin = float(own[0]) if alone else float(lead.min())
+    held, alone = len(stored), len(stored) == 1
+    own = stored.square().sum(-1)
+    rows = torch.arange(0, held, max(1, math.ceil(held * stored.numel() / LARGEST_WORK)))
+    rival = torch.cat([_best_rival(stored, part) for part in rows.to(own.device).split(512)])
+    margin = float(own[0]) if alone else float((own[rows] - rival).min())
     crosstalk = 0.0 if alone else float((rival / own[rows]).mean())
-    beta = fitting_beta(len(stored), margin, confidence)
-    return Crowding(held, capacity, held - len(stored), margin, crosstalk, beta)
+    beta = math.log(max(confidence * max(held - 1, 1), math.e)) / max(margin, 1e-6)
+    duplicates = len(associations) - held
+    return Crowding(len(associations), capacity, duplicates, margin, crosstalk, beta)
 
 
 def _distinct(rows: Tensor) -> Tensor:

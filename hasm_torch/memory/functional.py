@@ -7,13 +7,11 @@ A memory per sample (fast weights) is M = associate(s, o) of shape (batch, rows,
 ``recall`` with a query of the same leading dimension.
 """
 
-import torch
 from torch import Tensor
 
 from hasm_torch.encoders.bipolar import bind
 from hasm_torch.encoders.rope3d import rope3d
-from hasm_torch.memory.interaction import Interaction, check_interaction, interact
-from hasm_torch.memory.recall import recall_dense
+from hasm_torch.memory.recall import Interaction, Stored, check_interaction, recall_dense
 
 
 def associate(
@@ -55,6 +53,7 @@ def recall(
     beta: float | Tensor = 1.0,
     mask: Tensor | None = None,
     interaction: Interaction = "softmax",
+    top_k: int | None = None,
 ) -> Tensor:
     """Recall the decision for queries.
 
@@ -64,22 +63,15 @@ def recall(
         successors: S₋₁, (*batch, rows, value_dim).
         beta: β, a number or a () tensor.
         mask: Rows that each query may recall, (*batch, ..., rows) bool.
-        interaction: "softmax", "exponential" or a degree, see ``interaction``.
+        interaction: How a match becomes a weight, see ``HeteroAssociativeMemory``.
+        top_k: Best matches that weigh; None for all.
 
     Returns:
         d, (*batch, ..., value_dim); differentiable in query, associations, successors and β.
 
     Raises:
-        ValueError: If the shapes do not fit, or the interaction is unknown.
+        ValueError: If the shapes do not fit, or an option is unknown.
     """
-    check_interaction(interaction)
-    if interaction == "softmax":
-        return recall_dense(query, associations, successors, beta, mask=mask)
-    batch = associations.shape[:-2]
-    scores = query.reshape(*batch, -1, query.shape[-1]) @ associations.to(query.dtype).mT
-    scores = scores.reshape(*query.shape[:-1], associations.shape[-2])
-    if mask is not None:
-        scores = torch.where(mask, scores, torch.nan)
-    weights = interact(scores, beta, interaction)
-    weights = weights.reshape(*batch, -1, weights.shape[-1]).to(successors.dtype)
-    return (weights @ successors).reshape(*query.shape[:-1], successors.shape[-1])
+    check_interaction(interaction, top_k)
+    memory = Stored(associations, successors, beta, None, mask, interaction, top_k)
+    return recall_dense(query, memory)

@@ -9,22 +9,25 @@ Signals", sections "Association Creation" and "Hetero-associative Sequential Mem
 """
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor, nn
 
 from hasm_torch.encoders.bipolar import binarise
 from hasm_torch.encoders.rope3d import RoPE3D
-from hasm_torch.memory import functional
 from hasm_torch.memory.crowding import Crowding, crowding
-from hasm_torch.memory.interaction import Interaction, check_interaction, interact
 from hasm_torch.memory.recall import (
+    NORMALISED,
+    Interaction,
     Recall,
+    Stored,
+    check_interaction,
     inspect_dense,
     inspect_packed,
     recall_dense,
     recall_packed,
+    weights_dense,
+    weights_packed,
 )
 from hasm_torch.memory.store import INT8_STEPS, AssociationStore, Storage, WhenFull
 
@@ -41,6 +44,7 @@ class HeteroAssociativeMemory(AssociationStore):
     Attributes:
         associations: M, (capacity, code_dim); with ``storage="bit"`` packed by ``recall.pack``.
         successors: S₋₁, (capacity, value_dim), float32 or better.
+        origins: (capacity,) int64, where each association comes from; -1 where it was not told.
         count: () int64, number of associations held.
         oldest: () int64, row of the oldest association.
         beta: β, () float32 or better.
@@ -60,15 +64,20 @@ class HeteroAssociativeMemory(AssociationStore):
         learn_patterns: Whether associations and successors are parameters (float32 only).
         binarised: Whether associations and queries are taken by their sign, with a
             straight-through gradient; always so with "bit".
-        interaction: "softmax"; "exponential" or a degree for a dense associative memory, whose
-            weights are not normalised.
-        when_full: "error" refuses a write that does not fit; "overwrite" replaces the oldest.
+        interaction: "softmax"; "sparsemax" or "entmax15", with which all but the best matches weigh
+            nothing; "exponential" or a degree for a dense associative memory, whose weights are not
+            normalised. See ``recall.interaction``.
+        when_full: "error" refuses a write that does not fit; "overwrite" replaces the oldest;
+            "grow" doubles the capacity.
+        top_k: Only so many best matches weigh, and what matches exactly as well as the last of
+            them; None for all.
 
     Raises:
         ValueError: If a size is below 1, an option is unknown, or two options exclude each other.
     """
 
     beta: Tensor
+    _precise = ("successors", "beta")
 
     def __init__(
         self,
@@ -82,10 +91,11 @@ class HeteroAssociativeMemory(AssociationStore):
         binarised: bool = False,
         interaction: Interaction = "softmax",
         when_full: WhenFull = "error",
+        top_k: int | None = None,
     ) -> None:
         super().__init__(code_dim, value_dim, capacity, storage, learn_patterns, when_full)
-        check_interaction(interaction)
-        self.interaction = interaction
+        check_interaction(interaction, top_k)
+        self.interaction, self.top_k = interaction, top_k
         self.binarised = binarised or self.storage == "bit"
         self.rope = RoPE3D(code_dim)
         if isinstance(beta, nn.Parameter):
@@ -98,44 +108,12 @@ class HeteroAssociativeMemory(AssociationStore):
             else:
                 self.register_buffer("beta", value)
 
-    @property
-    def _precise(self) -> tuple[str, ...]:
-        return ("successors", "beta")
-
     def extra_repr(self) -> str:
         """Sizes and options, as printed."""
         return (
             f"code_dim={self.code_dim}, value_dim={self.value_dim}, capacity={self.capacity}, "
             f"storage={self.storage!r}, interaction={self.interaction!r}"
         )
-
-    def associate(
-        self,
-        state: Tensor,
-        observation: Tensor,
-        axis: Tensor | None = None,
-        angle: Tensor | None = None,
-    ) -> Tensor:
-        """Bind a state to an observation that is rotated by the touch.
-
-        Args:
-            state: s, (..., code_dim).
-            observation: o, (..., code_dim).
-            axis: Rotation axis of the touch, (..., 3); without it nothing is rotated.
-            angle: Rotation angle of the touch, (...,), rad.
-
-        Returns:
-            (..., code_dim), the association or the query.
-
-        Raises:
-            ValueError: If a code has another length, or only one of axis and angle is given.
-        """
-        for name, code in (("state", state), ("observation", observation)):
-            if code.shape[-1] != self.code_dim:
-                raise ValueError(
-                    f"expected {name} code (..., {self.code_dim}), got {tuple(code.shape)}"
-                )
-        return functional.associate(state, observation, axis, angle)
 
     def crowding(self, confidence: float = 1e6) -> Crowding:
         """Report how full and how crowded the memory is, with a β that fits; see ``crowding``.
@@ -187,14 +165,8 @@ class HeteroAssociativeMemory(AssociationStore):
             ValueError: If a shape is off.
             RuntimeError: If the memory is empty.
         """
-        self._check_query(query)
-        with _full_precision(query.device.type):
-            if self.interaction != "softmax":
-                weights = self._interacting(query, mask)
-                return weights.to(self.successors.dtype) @ self.successors
-            if self.storage == "bit":
-                return recall_packed(*self._packed(query), count=self.count, mask=mask)
-            return recall_dense(*self._dense(query), count=self.count, mask=mask)
+        recall = recall_packed if self.storage == "bit" else recall_dense
+        return recall(*self._asked(query, mask))
 
     def inspect(self, query: Tensor, mask: Tensor | None = None) -> Recall:
         """Recall, and tell how sure the memory is: a confident recall from a guess.
@@ -209,20 +181,19 @@ class HeteroAssociativeMemory(AssociationStore):
             ``entropy`` (...,) of the weights, nats, 0 if one association decides alone.
 
         Raises:
-            ValueError: If a shape is off, or the interaction is not "softmax".
+            ValueError: If a shape is off, or the weights of the interaction are not normalised.
             RuntimeError: If the memory is empty.
         """
-        self._check_query(query)
-        if self.interaction != "softmax":
+        if self.interaction not in NORMALISED:
             raise ValueError(
-                f"inspect needs normalised weights, interaction 'softmax', got {self.interaction!r}"
+                f"inspect needs normalised weights, interaction {' or '.join(NORMALISED)}, got "
+                f"{self.interaction!r}"
             )
-        with _full_precision(query.device.type):
-            if self.storage == "bit":
-                return inspect_packed(*self._packed(query), count=self.count, mask=mask)
-            recalled = inspect_dense(*self._dense(query), count=self.count, mask=mask)
-        scale = self._score_scale
-        return recalled._replace(score=recalled.score / scale, margin=recalled.margin / scale)
+        inspect = inspect_packed if self.storage == "bit" else inspect_dense
+        found = inspect(*self._asked(query, mask))
+        if (scale := self._score_scale) != 1:
+            found = found._replace(score=found.score / scale, margin=found.margin / scale)
+        return found
 
     def weights(self, query: Tensor, mask: Tensor | None = None) -> Tensor:
         """Weight of every stored association in the decision.
@@ -234,9 +205,10 @@ class HeteroAssociativeMemory(AssociationStore):
         Returns:
             (..., capacity), 0 for rows that are empty or masked.
         """
-        self._check_query(query)
-        with _full_precision(query.device.type):
-            return self._interacting(query, mask)
+        weigh = weights_packed if self.storage == "bit" else weights_dense
+        weights = weigh(*self._asked(query, mask))
+        unheld = self.capacity - weights.shape[-1]
+        return torch.nn.functional.pad(weights, (0, unheld)) if unheld else weights
 
     def iterate(
         self,
@@ -263,39 +235,28 @@ class HeteroAssociativeMemory(AssociationStore):
             state = encode(decisions[-1])
         return torch.stack(decisions, dim=-2)
 
-    def _packed(self, query: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return query, self.associations, self.successors, self.beta
-
-    def _dense(self, query: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        associations = self.associations
+    def _asked(self, query: Tensor, mask: Tensor | None) -> tuple[Tensor, Stored]:
+        """The query and the memory as the functions of ``recall`` take them."""
+        if query.shape[-1] != self.code_dim:
+            raise ValueError(f"expected query (..., {self.code_dim}), got {tuple(query.shape)}")
+        fixed = torch.compiler.is_compiling()
+        held = 0 if fixed else int(self.count)
+        if not (fixed or held):
+            raise RuntimeError("the memory is empty: write at least one association first")
+        how = self.interaction, self.top_k
+        if self.storage == "bit":
+            memory = self.associations, self.successors, self.beta, self.count, mask
+            return query, Stored(*memory, *how)
+        # What is held is enough, but a fixed shape asks to look at all rows.
+        rows = slice(self.capacity if fixed else held)
+        mask = mask if mask is None else mask[..., rows]
+        associations, beta = self.associations[rows], self.beta / self._score_scale
         if self.binarised:
             query, associations = binarise(query), binarise(associations)
-        return query, associations, self.successors, self.beta / self._score_scale
+        count = self.count if fixed else None
+        return query, Stored(associations, self.successors[rows], beta, count, mask, *how)
 
     @property
     def _score_scale(self) -> int:
         """What a stored entry's integer steps multiply the inner products by."""
         return INT8_STEPS if self.storage == "int8" and not self.binarised else 1
-
-    def _interacting(self, query: Tensor, mask: Tensor | None) -> Tensor:
-        codes = self._codes().to(torch.promote_types(query.dtype, torch.float32))
-        if self.binarised:
-            query, codes = binarise(query), binarise(codes)
-        scores = query.to(codes.dtype) @ codes.mT
-        absent = torch.arange(self.capacity, device=query.device) >= self.count
-        if mask is not None:
-            absent = absent | ~mask
-        return interact(scores.masked_fill(absent, torch.nan), self.beta, self.interaction)
-
-    def _check_query(self, query: Tensor) -> None:
-        if query.shape[-1] != self.code_dim:
-            raise ValueError(f"expected query (..., {self.code_dim}), got {tuple(query.shape)}")
-        if not torch.compiler.is_compiling() and int(self.count) == 0:
-            raise RuntimeError("the memory is empty: write at least one association first")
-
-
-def _full_precision(device: str) -> AbstractContextManager[None]:
-    """Scores in full precision under autocast; entering autocast costs, so only where it is on."""
-    if torch.is_autocast_enabled(device):
-        return torch.autocast(device, enabled=False)
-    return nullcontext()

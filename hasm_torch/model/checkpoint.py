@@ -103,10 +103,15 @@ def load_weights(model: nn.Module, directory: Path) -> None:
         for name, values in weights.items():
             if values.is_floating_point() and not bool(values.isfinite().all()):
                 raise ValueError(f"{name} holds NaN or infinity")
+        # The layer alone would do without origins; a model could then forget nothing.
+        missing = [name for name in model.state_dict() if name not in weights]
+        if missing:
+            raise ValueError(f"it lacks {', '.join(missing)}")
         model.load_state_dict(weights, strict=True)
         for name, values in weights.items():
             if name.endswith("memory.count"):
-                held = weights[name.removesuffix("memory.count") + "origins"]
+                part = name.removesuffix("memory.count")
+                held = weights[part + ("where" if part + "where" in weights else "origins")]
                 if int(values) != len(held):
                     raise ValueError(f"{int(values)} associations held, expected {len(held)}")
     except (RuntimeError, ValueError, KeyError, SafetensorError) as error:

@@ -22,11 +22,12 @@ from torch import Tensor
 from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig
 from hasm_torch.encoders.bipolar import binarise
-from hasm_torch.model.collect import COURSE_POINTS, Collected, Table
 from hasm_torch.model.frames import base_indices, into_base, out_of_base
+from hasm_torch.model.lessons import COURSE_POINTS
 from hasm_torch.model.query import QueryCode, parts_of
 from hasm_torch.model.readout import covariates_of, first_order, ridge_of, stored_values
 from hasm_torch.model.settled import Settled
+from hasm_torch.model.table import Table
 
 Array = NDArray[np.float64]
 
@@ -40,12 +41,20 @@ USUAL = (8.0, 15.0, float("inf"))  # at which joints and touch are compared
 SIZE_SHARE = 0.1
 ARGMAX_BETA = 1e4  # of inner products, which differ by 2 at least where entries are ±1
 ANGLES = {"mean": np.pi / 2, "first_order": np.pi / 4}
-QUERIES, PHASES = 160, 48  # predicted at most, evenly spread over the episodes
+# Rows predicted at most, and rows from which they are predicted, evenly spread over the episodes:
+# half of either changes no choice for the bundled episodes and takes half the time.
+QUERIES, PHASES, ROWS = 160, 48, 1500
 LOSS = 1.01  # a joint is left out unless the error rises by this factor
 EVEN = 1.02  # the mean, which shrinks what it averages over, must be better by this factor
 # The patch, which says nothing of one that was not touched, must be better than the direction by
 # this factor: where it names the function it is by far, and ten episodes misjudge by a fifth.
 NAMED = 1.3
+# Of a few episodes on different patches, what predicts no better than this share of standing still
+# tells nothing.
+TELLING = 0.9
+# In the middle between the courses of pushes that the robot yields to, straight by 0.95 with a
+# wandering finger, and those of grasps, 0.79.
+STRAIGHT = 0.87
 
 
 @dataclass
@@ -72,6 +81,8 @@ class HeldOut:
         weight: (V,) by which an error in each entry counts.
         most: Rows predicted at most.
         still: (K, V) what standing still would predict; zero by default.
+        named: Whether only other touches of the same patch tell anything, two at least; by default
+            one of the same rigid body is enough.
     """
 
     def __init__(
@@ -83,19 +94,22 @@ class HeldOut:
         weight: Tensor,
         most: int,
         still: Tensor | None = None,
+        named: bool = False,
     ) -> None:
         self.config, self.body, self.table = config, body, table
         self.values, self.weight = values, weight
         self._rows: Tensor | None = None
+        self._absent: dict[str, Tensor] = {}
         every = np.unique(np.linspace(0, len(table) - 1, most).round().astype(int))
         groups = table.episode if len(set(table.episode)) > 1 else np.arange(len(table))
         other = groups[every, None] != groups[None]
-        # From fewer than two touches of its patch in other episodes there is nothing to choose.
-        known = (other & (table.patch[every, None] == table.patch[None])).sum(axis=1) > 1
+        part = np.array(parts_of(body, "patch" if named else "direction"))[table.patch]
+        alike = (other & (part[every, None] == part[None])).sum(axis=1)
+        known = alike > (1 if named else 0)
         self.asked, self.possible = every[known], bool(known.any())
-        self.excluded = torch.where(torch.from_numpy(other[known]), 0.0, -torch.inf)
-        unmoved = torch.zeros_like(values) if still is None else still
-        self.still = self._cost(unmoved[self.asked])
+        self._own = ~torch.from_numpy(other[known])
+        self._unmoved = (torch.zeros_like(values) if still is None else still)[self.asked]
+        self.still = self._cost(self._unmoved)
         self.directed = still is None
 
     def _cost(self, predicted: Tensor) -> float:
@@ -122,22 +136,33 @@ class HeldOut:
             return size
         return (self._misled(predicted) + SIZE_SHARE * size) / (1.0 + SIZE_SHARE)
 
+    def _absence(self, settled: Settled) -> Tensor:
+        """(asked, K) −∞ at rows of the same episode or of another part, else 0."""
+        if settled.touch not in self._absent:
+            patch = self.table.patch
+            apart = other_parts(self.body, settled, patch[self.asked], patch)
+            self._absent[settled.touch] = absence(self._own | apart)
+        return self._absent[settled.touch]
+
     def best_error(self, settled: Settled, scores: Tensor) -> float:
         """The lowest of the errors of some usual recalls."""
         return min(self.error(settled, scores, s) for s in USUAL)
 
     def predicted(self, settled: Settled, scores: Tensor, softness: float) -> Tensor:
         """(asked, V) predictions."""
-        apart = other_parts(self.body, settled, self.table.patch[self.asked], self.table.patch)
-        weights = soft_weights((scores + self.excluded).masked_fill(apart, -torch.inf), softness)
+        absent = self._absence(settled)
+        # Of a patch that no other episode touches, the patch says nothing: it stands still.
+        nothing = (absent < 0).all(-1, keepdim=True)
+        weights = soft_weights(scores, absent.masked_fill(nothing, 0.0), softness)
         if settled.readout == "mean":
-            return weights @ self.values
+            return torch.where(nothing, self._unmoved, weights @ self.values)
         x, ridge = covariates(settled, self.table)
         if self._rows is None:  # the same for every choice of joints, touch and β
             values = stored_values(self.values.double().numpy(), x)
             self._rows = torch.from_numpy(values).float()
         recalled = (weights @ self._rows).double().numpy()
-        return torch.from_numpy(first_order(recalled, x[self.asked], ridge)).float()
+        law = torch.from_numpy(first_order(recalled, x[self.asked], ridge)).float()
+        return torch.where(nothing, self._unmoved, law)
 
 
 def other_parts(
@@ -156,51 +181,76 @@ def covariates(settled: Settled, table: Table, at: int = 0) -> tuple[Array, Arra
     return x, ridge_of(settled.value, len(observed))
 
 
-def soft_weights(scores: Tensor, softness: float) -> Tensor:
-    """Recall weights of agreements (..., K) at some βD; infinity is the argmax."""
+def absence(excluded: Tensor) -> Tensor:
+    """−∞ where something is excluded, else 0: what is added to scores."""
+    return torch.zeros(excluded.shape).masked_fill_(excluded, -torch.inf)
+
+
+def soft_weights(scores: Tensor, absent: Tensor, softness: float) -> Tensor:
+    """Recall weights of agreements (..., K) at some βD; infinity is the argmax.
+
+    Args:
+        scores: (..., K) agreements.
+        absent: (..., K) see ``absence``.
+        softness: βD.
+    """
     if np.isinf(softness):
-        best = scores >= scores.amax(-1, keepdim=True) - 1e-6
+        present = scores + absent
+        best = present >= present.amax(-1, keepdim=True) - 1e-6
         return best / best.sum(-1, keepdim=True)
-    # −inf times 0 would be NaN, so the excluded rows are masked again.
-    return torch.softmax((softness * scores).masked_fill(scores == -torch.inf, -torch.inf), -1)
+    return torch.softmax((softness * scores).add_(absent), -1)
 
 
-def table_codes(
-    config: HASMConfig, body: Body, settled: Settled, table: Table, at: int = 0
-) -> Tensor:
+def table_codes(config: HASMConfig, body: Body, settled: Settled, table: Table) -> Tensor:
     """Codes of all rows of a table, as the memory holds them, (K, D)."""
+    return _codes(config, settled, QueryCode(config, body, settled), table)
+
+
+def _codes(
+    config: HASMConfig, settled: Settled, code: QueryCode, table: Table, at: int = 0
+) -> Tensor:
+    """The same by a code that is there, at a point of the rows' courses."""
     direction = table.direction if table.direction.ndim == 2 else table.direction[:, at]
     density = np.clip(table.density, settled.density[0], settled.density[1])
     columns = (table.positions, density, table.patch, direction)
     observation = torch.from_numpy(table.observation) if settled.observed else None
-    codes = QueryCode(config, body, settled)(*map(torch.from_numpy, columns), observation)
+    codes = code(*map(torch.from_numpy, columns), observation)
     return binarise(codes) if config.storage == "bit" else codes
 
 
-def choose(config: HASMConfig, body: Body, settled: Settled, found: Collected) -> Choice:
+def choose(
+    config: HASMConfig, body: Body, settled: Settled, samples: Table, phases: Table
+) -> Choice:
     """Settle what the settings leave open; see the module.
 
     Args:
         config: Settings of the method; what they name is kept.
         body: Joints and skin of the robot.
         settled: What is settled already.
-        found: What the episodes hold.
+        samples: Stretches of motion that the episodes hold.
+        phases: Touches that they hold.
 
     Returns:
         The choice, and the errors of what was tried.
     """
     errors: dict[str, dict[str, float]] = {}
     options = {}
+    samples, phases = _thin(samples), _thin(phases)
     for value in ("displacement", "goal"):
         wanted = config.value if config.value != "successor" else "goal"
         if wanted in ("auto", value):
-            options[value] = _choose_recall(
-                config, body, replace(settled, value=value), found, errors
-            )
+            table = samples if value == "displacement" else phases
+            option = replace(settled, value=value)
+            options[value] = _choose_recall(config, body, option, table, errors)
     if len(options) == 2:
-        held = phase_errors(config, body, options, found)
-        errors |= {"value": held} if held else {}
-        best = min(held, key=held.__getitem__) if held else "goal"
+        held = phase_errors(config, body, options, samples, phases)
+        # Where the episodes cannot tell, one whose touches lead straight on is taken to yield.
+        tell = bool(held) and min(held.values()) < TELLING
+        usual = "displacement" if straightness(body, phases) > STRAIGHT else "goal"
+        best = min(held, key=held.__getitem__) if tell else usual
+        errors |= {"value": held} if tell else {}
+        if not tell and best == "displacement":
+            options[best] = _unjudged(config, body, replace(settled, value=best), samples)
     else:
         best = next(iter(options))
     chosen = options[best]
@@ -211,25 +261,29 @@ def choose(config: HASMConfig, body: Body, settled: Settled, found: Collected) -
     return Choice(chosen, errors)
 
 
+def _thin(table: Table) -> Table:
+    if len(table) <= ROWS:
+        return table
+    return table.rows(np.linspace(0, len(table) - 1, ROWS).round().astype(int))
+
+
 def _choose_recall(
     config: HASMConfig,
     body: Body,
     settled: Settled,
-    found: Collected,
+    table: Table,
     errors: dict[str, dict[str, float]],
 ) -> Settled:
     """Touch, joints, read-out and β for one kind of value."""
-    table = found.samples if settled.value == "displacement" else found.phases
     values, weight = recalled_values(body, settled, table)
     most = QUERIES if settled.value == "displacement" else PHASES
-    held = HeldOut(config, body, table, values, weight, most, unmoved(body, settled, table))
+    still, course = unmoved(body, settled, table), settled.value != "displacement"
+    held = HeldOut(config, body, table, values, weight, most, still, named=course)
     readouts = _readouts(config, settled)
     usual = replace(settled, readout=readouts[-1], angle=angle_of(config, readouts[-1]))
     touches = _touches(config)
     if not held.possible:
-        joints = _named(config, body) or _differing(body, settled, table)
-        beta = _beta(config, joints, SHARP_SOFTNESS)
-        return replace(usual, touch=touches[-1], joints=joints, beta=beta)
+        return _unjudged(config, body, settled, table)
     tried: dict[str, tuple[float, Settled]] = {}
     for touch in touches:
         tried[touch] = _coded_joints(config, body, replace(usual, touch=touch), held)
@@ -253,6 +307,20 @@ def _choose_recall(
         return pair[0] * (EVEN if pair[1].readout == "mean" else 1.0)
 
     return min(grid.values(), key=judged)[1]
+
+
+def _unjudged(config: HASMConfig, body: Body, settled: Settled, table: Table) -> Settled:
+    """What is taken where nothing can be predicted: each demonstration for itself."""
+    readout, touches = _readouts(config, settled)[-1], _touches(config)
+    joints = _named(config, body) or _differing(body, settled, table)
+    return replace(
+        settled,
+        touch=touches[0] if settled.value == "displacement" else touches[-1],
+        readout=readout,
+        angle=angle_of(config, readout),
+        joints=joints,
+        beta=_beta(config, joints, SHARP_SOFTNESS),
+    )
 
 
 def _coded_joints(
@@ -322,6 +390,14 @@ def _beta(config: HASMConfig, joints: list[int], softness: float) -> float:
     return softness / (len(joints) * config.neurons * config.bits)
 
 
+def straightness(body: Body, phases: Table) -> float:
+    """Median over touches of the distance from first to last point over the way between them."""
+    course = phases.moved / np.array(body.max_speed)
+    way = np.linalg.norm(np.diff(course, axis=1), axis=2).sum(axis=1)
+    far = np.linalg.norm(course[:, -1] - course[:, 0], axis=1)
+    return float(np.median(far[way > 0] / way[way > 0])) if (way > 0).any() else 0.0
+
+
 def unmoved(body: Body, settled: Settled, table: Table) -> Tensor:
     """(K, V) values of ``recalled_values`` if no joint moved."""
     standing = Table(**{**vars(table), "moved": np.zeros_like(table.moved)})
@@ -347,14 +423,13 @@ def recalled_values(body: Body, settled: Settled, table: Table) -> tuple[Tensor,
 
 
 def phase_errors(
-    config: HASMConfig, body: Body, options: dict[str, Settled], found: Collected
+    config: HASMConfig, body: Body, options: dict[str, Settled], samples: Table, phases: Table
 ) -> dict[str, float]:
     """Error of held-out touches, each driven from its first moment to its end by its own spikes."""
-    phases = found.phases
     values, weight = recalled_values(body, options["goal"], phases)
     held = HeldOut(config, body, phases, values, weight, PHASES)
     if len(set(phases.episode)) < 2 or not held.possible:
-        return {}
+        return {}  # of one episode, no touch can be driven by others
     asked = held.asked
     moved = options["goal"].moved
     speed = np.array(body.max_speed)[moved]
@@ -366,8 +441,8 @@ def phase_errors(
     course = course[:, :-1].unflatten(1, (COURSE_POINTS, -1)).double().numpy()
     anchored = np.array([j in body.limited for j in moved])
     course = course - np.where(anchored, phases.positions[asked][:, moved], 0.0)[:, None]
-    table, settled = found.samples, options["displacement"]
-    held = HeldOut(config, body, table, *recalled_values(body, settled, table), 1)
+    settled = options["displacement"]
+    held = HeldOut(config, body, samples, *recalled_values(body, settled, samples), 1)
     driven = _driven(held, settled, phases.rows(asked))[:, :, moved]
     return {
         "displacement": float(np.square((driven - real) / speed).sum()) / still,
@@ -385,9 +460,12 @@ def _driven(held: HeldOut, settled: Settled, phases: Table) -> Array:
     body, base = held.body, base_indices(held.body)
     at = phases.positions.copy()
     steps = [np.zeros_like(at)]
-    groups = torch.from_numpy(phases.episode[:, None] == held.table.episode[None])
-    groups = groups | other_parts(body, settled, phases.patch, held.table.patch)
-    codes = table_codes(held.config, body, settled, held.table)
+    own = torch.from_numpy(phases.episode[:, None] == held.table.episode[None])
+    apart = own | other_parts(body, settled, phases.patch, held.table.patch)
+    nothing = apart.all(-1).numpy()  # such a touch moves nothing
+    absent = absence(apart & ~apart.all(-1, keepdim=True))
+    code = QueryCode(held.config, body, settled)
+    codes = _codes(held.config, settled, code, held.table)
     dim = codes.shape[1]
     rows = held.values
     if settled.readout == "first_order":
@@ -395,15 +473,14 @@ def _driven(held: HeldOut, settled: Settled, phases: Table) -> Array:
         rows = torch.from_numpy(stored_values(held.values.double().numpy(), x)).float()
     for n in range(COURSE_POINTS - 1):
         now = replace_positions(phases, at)
-        query = table_codes(held.config, body, settled, now, n)
-        scores = (query @ codes.T / dim).masked_fill(groups, -torch.inf)
-        weights = soft_weights(scores, softness_of(settled.beta, dim))
+        query = _codes(held.config, settled, code, now, n)
+        weights = soft_weights(query @ codes.T / dim, absent, softness_of(settled.beta, dim))
         recalled = (weights @ rows).double().numpy()
         if settled.readout == "first_order":
             recalled = first_order(recalled, covariates(settled, now, n)[0], ridge)
         step = np.zeros_like(at)
         step[:, settled.moved] = recalled
-        step *= (phases.spikes / (COURSE_POINTS - 1))[:, None]
+        step *= np.where(nothing, 0.0, phases.spikes / (COURSE_POINTS - 1))[:, None]
         yaw = at[:, base[2]] if base else 0.0
         at = np.clip(at + out_of_base(step, yaw, base), body.lower, body.upper)
         onset = phases.positions[:, base[2]] if base else 0.0

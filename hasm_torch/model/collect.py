@@ -1,4 +1,4 @@
-"""From episodes to what can be stored: what every spike did, and the course of every touch.
+"""From an episode to what can be stored: what every spike did, and the course of every touch.
 
 A *sample* is a stretch of ``horizon`` samples of an episode in which the skin spikes: where it
 began, how it was touched, and how far the joints moved. A *phase* is a touch of one patch, pauses
@@ -6,8 +6,6 @@ included, until another patch is touched or the episode ends: where it began, an
 joints by spikes.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -19,11 +17,13 @@ from hasm_torch.config import HASMConfig
 from hasm_torch.encoders.touch import pair_with_spikes
 from hasm_torch.model.felt import Recording, Touch, felt
 from hasm_torch.model.frames import base_indices, into_base
+from hasm_torch.model.lessons import COURSE_POINTS, Lesson
+from hasm_torch.model.moments import Series
 from hasm_torch.model.settled import Settled
+from hasm_torch.model.table import Table, empty_table, joined
 
 Array = NDArray[np.float64]
 
-COURSE_POINTS = 32  # of a course; grasps of four straight legs need some eight a leg
 # Stretches with fewer spikes than this share of the usual number are left out: what one stray spike
 # did is mostly what was done without it.
 LEAST_SPIKES = 0.25
@@ -31,132 +31,47 @@ SHORTEST_PHASE = 3  # samples with spikes; shorter ones are flicker between two 
 ARRIVED = 0.005  # share of a course's length; what is nearer to its end is no motion
 
 
-@dataclass
-class Table:
-    """Samples or phases, K of them.
-
-    Attributes:
-        positions: (K, J) joint positions where it began, rad or m.
-        moved: (K, J) displacement of a sample, a time of the base in the base's frame; of a phase
-            (K, N, J), the course as displacements from the positions where it began.
-        spikes: (K,) spikes that it took.
-        density: (K,) rate density ρ of the touch.
-        patch: (K,) int64, patch that is touched.
-        direction: (K, 3) direction of the force, zero where nothing pushes; of a phase (K, N, 3),
-            along its course.
-        observation: (K, O) further observations.
-        episode: (K,) int64 number of the episode in the order given.
-        frame: (K,) int64 sample of the episode where it began.
-    """
-
-    positions: Array
-    moved: Array
-    spikes: Array
-    density: Array
-    patch: NDArray[np.int64]
-    direction: Array
-    observation: Array
-    episode: NDArray[np.int64]
-    frame: NDArray[np.int64]
-
-    def rows(self, index: NDArray[np.int64] | NDArray[np.bool_]) -> "Table":
-        """Some of them."""
-        return Table(**{name: column[index] for name, column in vars(self).items()})
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-
-@dataclass
-class Collected:
-    """What some episodes hold.
-
-    Attributes:
-        samples: Stretches of motion.
-        phases: Touches.
-        paths: (T, J) memorised positions of each episode that holds a phase, by its number.
-        counts: (T,) spikes of all patches of each such episode.
-        lag: (J,) largest distance between target and measured position, rad or m.
-        episodes: Episodes read.
-        led: Correlation of motion and spikes over all samples; 1 where no sample differs from
-            another. In what was taught by touch the joints move where it spikes.
-    """
-
-    samples: Table
-    phases: Table
-    paths: dict[int, Array] = field(default_factory=dict)
-    counts: dict[int, Array] = field(default_factory=dict)
-    lag: Array = field(default_factory=lambda: np.zeros(0))
-    episodes: int = 0
-    led: float = 1.0
-
-
 def collect(
-    config: HASMConfig, body: Body, settled: Settled, episodes: Iterable[Recording]
-) -> Collected:
-    """Read episodes, one at a time.
+    config: HASMConfig, body: Body, settled: Settled, episode: Recording, number: int = 0
+) -> Lesson:
+    """Read an episode.
 
     Args:
         config: Settings of the method.
         body: Joints and skin of the robot.
-        settled: Threshold and current of the skin.
-        episodes: The recordings.
+        settled: Threshold and current of the skin, and what drives the robot.
+        episode: The recording.
+        number: Its number, for errors and for what is found.
 
     Returns:
-        What they hold.
+        What it teaches.
 
     Raises:
-        ValueError: If there is no episode, or one does not fit the body or is not finite.
+        ValueError: If it does not fit the body or is not finite.
     """
-    found = Collected(empty_table(body, 0), empty_table(body, COURSE_POINTS))
-    samples, phases = [found.samples], [found.phases]
-    speed = np.array(body.max_speed)
-    motions, spikes = [], []
-    lag = np.zeros(len(body.joints))
-    for number, episode in enumerate(episodes):
-        state, action = positions_of(body, episode, number)
-        path = action if config.pattern == "action" else state
-        observation = observations_of(body, episode, number, len(path))
-        touch = felt(config, body, settled, episode)
-        lag = np.maximum(lag, np.abs(action - state).max(axis=0))
-        motions.append((np.abs(np.diff(path, axis=0)) / speed).max(axis=1))
-        spikes.append(touch.spikes.sum(axis=1)[1:])
-        mine = _phases(config, body, path, touch, observation, number)
-        if len(mine):
-            phases.append(mine)
-            found.paths[number], found.counts[number] = path, touch.spikes.sum(axis=1)
-        samples.append(_samples(config, body, path, touch, observation, number, mine))
-        found.episodes = number + 1
-    if found.episodes == 0:
-        raise ValueError("no episode to learn from: expected at least one")
-    found.samples, found.phases = joined(samples), joined(phases)
-    found.lag = lag
-    motion, spiked = np.concatenate(motions), np.concatenate(spikes)
-    if np.ptp(motion) > 0 and np.ptp(spiked) > 0:
-        found.led = float(np.corrcoef(motion, spiked)[0, 1])
-    return found
-
-
-def empty_table(body: Body, points: int) -> Table:
-    """A table of no samples, or of no phases with courses of so many points."""
-    joints = len(body.joints)
-    return Table(
-        positions=np.zeros((0, joints)),
-        moved=np.zeros((0, points, joints) if points else (0, joints)),
-        spikes=np.zeros(0),
-        density=np.zeros(0),
-        patch=np.zeros(0, np.int64),
-        direction=np.zeros((0, points, 3) if points else (0, 3)),
-        observation=np.zeros((0, sum(body.observations.values()))),
-        episode=np.zeros(0, np.int64),
-        frame=np.zeros(0, np.int64),
+    state, action = positions_of(body, episode, number)
+    period = 1.0 / body.rate
+    if settled.drive == "time":
+        density: Array = np.zeros((len(state), 0))
+        if body.channels:
+            density = felt(config, body, settled, episode).density
+        series = Series(torch.from_numpy(state), torch.from_numpy(density))
+        nothing = empty_table(body, 0), empty_table(body, COURSE_POINTS)
+        lag = np.zeros(len(body.joints))
+        return Lesson(number, len(state) * period, *nothing, lag, series=series)
+    path = action if config.pattern == "action" else state
+    observation = observations_of(body, episode, number, len(path))
+    touch = felt(config, body, settled, episode)
+    phases = _phases(config, body, path, touch, observation, number)
+    pace = (np.abs(np.diff(path, axis=0)) / np.array(body.max_speed)).max(axis=1)
+    return Lesson(
+        number,
+        len(path) * period,
+        _samples(config, body, path, touch, observation, number, phases),
+        phases,
+        np.abs(action - state).max(axis=0),
+        np.stack([pace, touch.spikes.sum(axis=1)[1:]], axis=1),
     )
-
-
-def joined(tables: list[Table]) -> Table:
-    """Tables one after the other."""
-    names = vars(tables[0])
-    return Table(**{name: np.concatenate([vars(t)[name] for t in tables]) for name in names})
 
 
 def positions_of(body: Body, episode: Recording, number: int) -> tuple[Array, Array]:

@@ -45,6 +45,20 @@ class Touched(NamedTuple):
     observation: Array
 
 
+class Asked(NamedTuple):
+    """One recall of a control step.
+
+    Attributes:
+        touch: What was felt.
+        query: (D,) what the memory was asked.
+        positions: (joints,) for which positions, rad or m.
+    """
+
+    touch: Touched
+    query: Tensor
+    positions: Array
+
+
 @dataclass
 class Course:
     """Where a touch leads.
@@ -105,7 +119,7 @@ class Rollout:
         touched: Names of the taught patches that spiked in the last step.
         reference: (J,) the joint state asked for; None before the first valid reading.
         courses: The course of each patch whose touch goes on, by its index.
-        queries: Patch and query (D,) of every recall of the last step.
+        asked: The recalls of the last step.
         history: Measured positions, (J,) each, of a robot that time moves on.
         moment: What was last asked of its memory.
     """
@@ -117,7 +131,7 @@ class Rollout:
     touched: list[str] = field(default_factory=list)
     reference: Array | None = None
     courses: dict[int, Course] = field(default_factory=dict)
-    queries: list[tuple[int, Tensor]] = field(default_factory=list)
+    asked: list[Asked] = field(default_factory=list)
     history: list[Array] = field(default_factory=list)
     moment: Moments | None = None
 
@@ -140,5 +154,5 @@ def limit_speed(before: Array, after: Array, max_speed: Array, period: float) ->
         (joints,) positions that the limits allow.
     """
     way = after - before
-    share = float((np.abs(way) / (SPEED_SHARE * period * max_speed)).max())
+    share = np.abs(way / max_speed).max() / (SPEED_SHARE * period)
     return after if share <= 1.0 else before + way / share

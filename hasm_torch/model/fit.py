@@ -1,7 +1,10 @@
 """Learning: from episodes to a memory, with everything chosen that the settings leave open.
 
-``fit`` reads the episodes, settles what fits them and returns the rows of the memory; it changes
-nothing. ``HASM.fit`` puts what it returns in place.
+    episodes ──collect──► lessons ──settle──► settings ──build──► memory
+
+``fit`` does all of it and changes nothing: ``HASM.fit`` puts what it returns in place. An episode
+that is learned later is a lesson more: what ``facts_of`` and ``rows`` say of it is what they would
+have said in the beginning.
 """
 
 from collections.abc import Iterable
@@ -18,20 +21,15 @@ from hasm_torch.encoders.place_code import PlaceCode
 from hasm_torch.memory.successors import distinct_links
 from hasm_torch.model.choose import choose, covariates, recalled_values, table_codes
 from hasm_torch.model.choose_timed import choose_timed, stored
-from hasm_torch.model.collect import (
-    COURSE_POINTS,
-    Collected,
-    Table,
-    collect,
-    joined,
-    positions_of,
-)
-from hasm_torch.model.felt import Recording, calibrate, felt
+from hasm_torch.model.collect import collect
+from hasm_torch.model.felt import Recording, calibrate
 from hasm_torch.model.frames import base_indices, out_of_base
-from hasm_torch.model.moments import Series, moments
+from hasm_torch.model.lessons import COURSE_POINTS, Lessons
+from hasm_torch.model.moments import moments
 from hasm_torch.model.readout import stored_values
 from hasm_torch.model.recalling import Recalling
 from hasm_torch.model.settled import Settled
+from hasm_torch.model.table import Table, joined
 from hasm_torch.model.timed import Timed
 
 Array = NDArray[np.float64]
@@ -88,24 +86,25 @@ class Fitted:
     Attributes:
         settled: What was chosen.
         memory: The memory with its codes, filled.
-        tolerance: (J,) how far the reference may be from a joint, rad or m.
+        lessons: What every episode taught.
         report: For people.
     """
 
     settled: Settled
     memory: Recalling | Timed
-    tolerance: Tensor
+    lessons: Lessons
     report: FitReport
 
 
 @torch.no_grad()
-def fit(config: HASMConfig, body: Body, episodes: Iterable[Recording]) -> Fitted:
+def fit(config: HASMConfig, body: Body, episodes: Iterable[Recording], first: int = 0) -> Fitted:
     """Learn episodes.
 
     Args:
         config: Settings of the method; what they leave open is chosen by held-out prediction.
         body: Joints and skin of the robot.
         episodes: Recordings of the body.
+        first: Number of the first one.
 
     Returns:
         What was learned.
@@ -131,76 +130,103 @@ def fit(config: HASMConfig, body: Body, episodes: Iterable[Recording]) -> Fitted
         capacity=0,
         taught=[],
     )
+    lessons = read(config, body, settled, episodes, first)
+    if config.drive == "auto" and settled.drive == "spike" and lessons.led() < LED_BY_TOUCH:
+        settled = replace(settled, drive="time")
+        lessons = read(config, body, settled, episodes, first)
+    return settle(config, body, settled, lessons)
+
+
+def read(
+    config: HASMConfig,
+    body: Body,
+    settled: Settled,
+    episodes: Iterable[Recording],
+    first: int = 0,
+) -> Lessons:
+    """Read episodes, one at a time; arguments as in ``fit``."""
+    lessons = Lessons(body)
+    lessons.next = first
+    for number, episode in enumerate(episodes, first):
+        lessons.add(collect(config, body, settled, episode, number))
+    if not len(lessons):
+        raise ValueError("no episode to learn from: expected at least one")
+    return lessons
+
+
+def settle(config: HASMConfig, body: Body, settled: Settled, lessons: Lessons) -> Fitted:
+    """Choose what the settings leave open, and build the memory.
+
+    Args:
+        config: Settings of the method.
+        body: Joints and skin of the robot.
+        settled: With the drive, threshold and current of the skin.
+        lessons: What the episodes taught.
+    """
     if settled.drive == "time":
-        return _fit_timed(config, body, settled, episodes)
-    found = collect(config, body, settled, episodes)
-    if config.drive == "auto" and found.led < LED_BY_TOUCH:
-        return _fit_timed(config, body, replace(settled, drive="time"), episodes)
-    if not len(found.samples) or not len(found.phases):
-        raise ValueError(
-            f"none of the {found.episodes} episodes holds a touch that makes a neuron spike; "
-            "check the tactile feature's unit (N) and current_per_newton"
-        )
-    moved = _moved(body, found)
+        return _settle_timed(config, body, settled, lessons)
+    settled = facts_of(body, settled, lessons)
+    choice = choose(config, body, settled, lessons.samples, lessons.phases)
+    settled = replace(choice.settled, chosen_from=len(lessons))
+    settled, memory = build(config, body, settled, lessons)
+    return Fitted(settled, memory, lessons, reported(body, settled, memory, lessons, choice.errors))
+
+
+def _settle_timed(config: HASMConfig, body: Body, settled: Settled, lessons: Lessons) -> Fitted:
+    """The same for a robot that time moves on."""
     settled = replace(
         settled,
-        moved=sorted(set().union(*moved.values())),
-        moved_by=moved,
-        density=[float(found.phases.density.min()), float(found.phases.density.max())],
-        observed=_observed(found.samples.observation),
+        value="displacement",
+        readout="first_order",
+        taught=body.patches,
+        moved=list(range(len(body.joints))),
     )
-    choice = choose(config, body, settled, found)
-    table, values = _rows(config, body, choice.settled, found)
-    taught = [body.patches[p] for p in np.unique(table.patch)]
-    settled = replace(choice.settled, capacity=len(table), taught=taught)
-    memory = Recalling(config, body, settled)
-    origins = torch.from_numpy(np.stack([table.episode, table.frame, table.patch], axis=1))
-    memory.fill(table_codes(config, body, settled, table), values, origins)
-    choices = {
-        "drive": settled.drive,
-        "touch": settled.touch,
-        "value": settled.value,
-        "readout": settled.readout,
-        "βD": f"{settled.beta * memory.code.code_dim:.3g}",
-        "joints": " ".join(body.joints[j] for j in settled.joints),
-    }
-    report = FitReport(found.episodes, len(table), taught, choices, choice.errors)
-    return Fitted(settled, memory, tolerance_of(body, found.lag), report)
+    settled, errors = choose_timed(config, body, settled, lessons.series)
+    settled = replace(settled, chosen_from=len(lessons))
+    settled, memory = build(config, body, settled, lessons)
+    return Fitted(settled, memory, lessons, reported(body, settled, memory, lessons, errors))
 
 
-def _fit_timed(
-    config: HASMConfig, body: Body, settled: Settled, episodes: Iterable[Recording]
-) -> Fitted:
-    """Learn the episodes of a robot that time moves on."""
-    series = [timed_series(config, body, settled, e, number) for number, e in enumerate(episodes)]
-    if not series:
-        raise ValueError("no episode to learn from: expected at least one")
-    settled = replace(settled, value="displacement", readout="first_order", taught=body.patches)
-    settled, errors = choose_timed(config, body, settled, series)
-    rows = moments(series, settled.past, config.horizon)
-    settled = replace(settled, capacity=len(rows.state), moved=list(range(len(body.joints))))
-    memory = stored(config, body, settled, rows)
+def reported(
+    body: Body,
+    settled: Settled,
+    memory: Recalling | Timed,
+    lessons: Lessons,
+    errors: dict[str, dict[str, float]],
+) -> FitReport:
+    """What was learned and chosen, and the errors of what was tried, for people."""
+    if settled.drive == "time":
+        chosen = {
+            "frames back": " ".join(map(str, settled.past)),
+            "touch": f"{settled.flip:g} of the code",
+            "trend": str(settled.trend),
+        }
+    else:
+        chosen = {"touch": settled.touch, "value": settled.value, "readout": settled.readout}
     choices = {
         "drive": settled.drive,
-        "frames back": " ".join(map(str, settled.past)),
-        "touch": f"{settled.flip:g} of the code",
-        "trend": str(settled.trend),
+        **chosen,
         "βD": f"{settled.beta * memory.code_dim:.3g}",
         "joints": " ".join(body.joints[j] for j in settled.joints),
     }
-    report = FitReport(len(series), settled.capacity, settled.taught, choices, errors)
-    return Fitted(settled, memory, tolerance_of(body, np.zeros(len(body.joints))), report)
+    return FitReport(len(lessons), settled.capacity, settled.taught, choices, errors)
 
 
-def timed_series(
-    config: HASMConfig, body: Body, settled: Settled, episode: Recording, number: int
-) -> Series:
-    """One episode of a robot that time moves on: measured positions and rate densities."""
-    state, _ = positions_of(body, episode, number)
-    if not body.channels:
-        return Series(torch.from_numpy(state), torch.zeros(len(state), 0, dtype=torch.float64))
-    density = felt(config, body, settled, episode).density
-    return Series(torch.from_numpy(state), torch.from_numpy(density))
+def build(
+    config: HASMConfig, body: Body, settled: Settled, lessons: Lessons
+) -> tuple[Settled, Recalling | Timed]:
+    """The memory of some lessons under what was chosen, and its capacity settled."""
+    if settled.drive == "time":
+        found = moments(lessons.series, settled.past, config.horizon)
+        number = torch.tensor([x.number for x in lessons if x.series is not None])
+        found = found._replace(episode=number[found.episode])
+        return replace(settled, capacity=len(found.state)), stored(config, body, settled, found)
+    keys, values = rows(config, body, settled, lessons.samples, lessons.phases)
+    taught = [body.patches[p] for p in np.unique(keys.patch)]
+    settled = replace(settled, capacity=len(keys), taught=taught)
+    memory = Recalling(config, body, settled)
+    memory.append(table_codes(config, body, settled, keys), values, keys)
+    return settled, memory
 
 
 def tolerance_of(body: Body, lag: Array) -> Tensor:
@@ -208,44 +234,57 @@ def tolerance_of(body: Body, lag: Array) -> Tensor:
     return torch.from_numpy(LAG_FACTOR * lag + LAG_SECONDS * np.array(body.max_speed)).float()
 
 
-def _moved(body: Body, found: Collected) -> dict[str, list[int]]:
-    """Joints that the touches of each patch move."""
+def facts_of(body: Body, settled: Settled, lessons: Lessons) -> Settled:
+    """What follows from the lessons without choosing: ranges, and which joints a touch moves.
+
+    Raises:
+        ValueError: If no lesson holds a touch, or no touch moves a joint.
+    """
     span = np.array(body.upper) - np.array(body.lower)
     least = np.where(
         np.isfinite(span), MOVED_SHARE * span, MOVED_SECONDS * np.array(body.max_speed)
     )
-    travel = np.ptp(found.phases.moved, axis=1)
-    moved = {
-        body.patches[patch]: np.flatnonzero(
-            travel[found.phases.patch == patch].max(axis=0) > least
-        ).tolist()
-        for patch in np.unique(found.phases.patch)
-    }
+    patches = sorted(set().union(*(lesson.travel for lesson in lessons)))
+    if not patches or not any(len(lesson.samples) for lesson in lessons):
+        raise ValueError(
+            f"none of the {len(lessons)} episodes holds a touch that makes a neuron spike; "
+            "check the tactile feature's unit (N) and current_per_newton"
+        )
+    moved = {}
+    for patch in patches:
+        travel = [lesson.travel[patch] for lesson in lessons if patch in lesson.travel]
+        moved[body.patches[patch]] = np.flatnonzero(np.max(travel, axis=0) > least).tolist()
     if not any(moved.values()):
         raise ValueError(
-            f"no joint moves under touch in any of the {found.episodes} episodes: expected one to "
+            f"no joint moves under touch in any of the {len(lessons)} episodes: expected one to "
             f"travel more than {MOVED_SHARE:.0%} of its range"
         )
-    return moved
+    lowest, highest = np.array([lesson.density for lesson in lessons]).T
+    return replace(
+        settled,
+        moved=sorted(set().union(*moved.values())),
+        moved_by=moved,
+        density=[float(lowest.min()), float(highest.max())],
+        observed=_observed(np.array([lesson.observed for lesson in lessons])),
+    )
 
 
-def _observed(observations: Array) -> list[list[float]]:
-    """Range over which each entry is coded."""
-    ranges = []
-    for column in observations.T:
-        low, high = float(column.min()), float(column.max())
+def _observed(ranges: Array) -> list[list[float]]:
+    """Range over which each entry is coded, from the lessons' own ranges (N, 2, O)."""
+    coded = []
+    for low, high in zip(ranges[:, 0].min(0).tolist(), ranges[:, 1].max(0).tolist()):
         room = OBSERVED_MARGIN * (high - low) or 1e-3 * max(1.0, abs(high))
-        ranges.append([low - room, high + room])
-    return ranges
+        coded.append([low - room, high + room])
+    return coded
 
 
-def _rows(
-    config: HASMConfig, body: Body, settled: Settled, found: Collected
+def rows(
+    config: HASMConfig, body: Body, settled: Settled, samples: Table, phases: Table
 ) -> tuple[Table, Tensor]:
-    """What the memory stores: keys and values."""
+    """What the memory stores of some samples and phases: keys and values."""
     if settled.value == "successor":
-        return _walk(config, body, settled, found)
-    table = found.samples if settled.value == "displacement" else found.phases
+        return _walk(config, body, settled, samples, phases)
+    table = samples if settled.value == "displacement" else phases
     values, _ = recalled_values(body, settled, table)
     if settled.readout == "first_order":
         x, _ = covariates(settled, table)
@@ -254,12 +293,12 @@ def _rows(
 
 
 def _walk(
-    config: HASMConfig, body: Body, settled: Settled, found: Collected
+    config: HASMConfig, body: Body, settled: Settled, samples: Table, phases: Table
 ) -> tuple[Table, Tensor]:
     """States and the states that follow them: of distinct ones, or of all samples."""
     anchored = np.array([j in body.limited for j in settled.moved])
     if not config.distinct:
-        table = found.samples
+        table = samples
         onward = table.moved[:, settled.moved]
         following = np.where(anchored, table.positions[:, settled.moved], 0.0) + onward
         values = np.concatenate([following, table.spikes[:, None]], axis=1)
@@ -273,8 +312,8 @@ def _walk(
         config.width,
         config.code,
     )
-    for patch in np.unique(found.phases.patch):
-        states = _states(body, found.phases.rows(found.phases.patch == patch))
+    for patch in np.unique(phases.patch):
+        states = _states(body, phases.rows(phases.patch == patch))
         codes = coder(torch.from_numpy(states.positions[:, settled.joints]).float())
         phase = torch.arange(len(states)) // COURSE_POINTS
         links = distinct_links(codes, phase, config.resolution)

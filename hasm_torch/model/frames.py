@@ -37,6 +37,8 @@ def out_of_base(displacement: Array, yaw: Array | float, base: list[int]) -> Arr
     """The inverse of ``into_base``."""
     if not base:
         return displacement
+    if not (displacement[..., base[0]].any() or displacement[..., base[1]].any()):
+        return displacement
     turned = displacement.copy()
     x, y = displacement[..., base[0]], displacement[..., base[1]]
     cosine, sine = np.cos(yaw), np.sin(yaw)

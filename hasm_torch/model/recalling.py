@@ -4,18 +4,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from hasm_torch import kernels
 from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig
 from hasm_torch.kernels.readout import first_order_of_one
 from hasm_torch.memory.layer import HeteroAssociativeMemory
-from hasm_torch.model.collect import COURSE_POINTS
 from hasm_torch.model.control import Course, Touched
 from hasm_torch.model.frames import base_indices, out_of_base
+from hasm_torch.model.lessons import COURSE_POINTS
 from hasm_torch.model.query import QueryCode, parts_of
 from hasm_torch.model.readout import covariates_of, first_order, ridge_of
 from hasm_torch.model.settled import Settled
+from hasm_torch.model.table import Table
 
 Array = NDArray[np.float64]
 
@@ -25,8 +27,8 @@ class Recalling(nn.Module):
 
     Attributes:
         code: Makes the queries.
-        memory: The associations and what each recalls.
-        origins: (K, 3) int64: episode, sample and patch from which each association comes.
+        memory: The associations, what each recalls, and from which episode each comes.
+        where: (K, 2) int64: sample of the episode, and patch, from which each association comes.
 
     Args:
         config: Settings of the method.
@@ -34,7 +36,7 @@ class Recalling(nn.Module):
         settled: What was chosen; sizes the memory.
     """
 
-    origins: Tensor
+    where: Tensor
 
     def __init__(self, config: HASMConfig, body: Body, settled: Settled) -> None:
         super().__init__()
@@ -60,29 +62,51 @@ class Recalling(nn.Module):
         self.memory = HeteroAssociativeMemory(
             self.code.code_dim,
             values,
-            settled.capacity,
+            max(settled.capacity, 1),
             beta=torch.tensor(settled.beta, dtype=torch.float64),
             storage=config.storage,
+            when_full="grow",
         )
-        self.register_buffer("origins", torch.zeros(settled.capacity, 3, dtype=torch.int64))
+        self.register_buffer("where", torch.zeros(settled.capacity, 2, dtype=torch.int64))
         self._parts = parts_of(body, settled.touch)
         self._masks: list[Tensor | None] | None = None
 
-    def fill(self, codes: Tensor, successors: Tensor, origins: Tensor) -> None:
-        """Store associations (K, D) with what each recalls (K, values) and its origin (K, 3)."""
-        self.memory.clear()
-        self.memory.write(codes, torch.ones_like(codes), successors)
-        self.origins.copy_(origins)
+    @property
+    def code_dim(self) -> int:
+        """D, entries of a query."""
+        return self.code.code_dim
+
+    @property
+    def origins(self) -> Tensor:
+        """(K, 3) episode, sample and patch from which each association comes."""
+        return torch.cat([self.memory.origins[: len(self.where), None], self.where], dim=1)
+
+    def append(self, codes: Tensor, successors: Tensor, keys: Table) -> None:
+        """Store associations (K, D) with what each recalls (K, values) and what they are made of.
+
+        The associations of a later call stand behind those of an earlier one.
+        """
+        held = int(self.memory.count)
+        episode = torch.from_numpy(keys.episode)
+        self.memory.write(codes, torch.ones_like(codes), successors, origin=episode)
+        where = torch.from_numpy(np.stack([keys.frame, keys.patch], axis=1))
+        self.where = torch.cat([self.where[:held], where.to(self.where.device)])
+        self._masks = None
+
+    def remove(self, episode: int) -> None:
+        """Forget the associations of an episode; the others keep their order."""
+        self.where = self.where[self.memory.origins[: len(self.where)] != episode]
+        self.memory.remove(origin=episode)
         self._masks = None
 
     def query(self, positions: Array, touch: Touched) -> Tensor:
         """Q of one control step, (D,)."""
         least, greatest = self.settled.density
         density = min(max(touch.density, least), greatest)
-        if kernels.enabled() and self.origins.device.type == "cpu":
+        if kernels.enabled() and self.where.device.type == "cpu":
             touched = touch.patch, touch.direction, touch.observation
             return self.code.in_arrays(positions, density, *touched)
-        device = self.origins.device
+        device = self.where.device
         row = [torch.from_numpy(x)[None].to(device) for x in (positions, touch.direction)]
         observation = torch.from_numpy(touch.observation)[None].to(device)
         patch = torch.tensor([touch.patch], device=device)
@@ -92,15 +116,26 @@ class Recalling(nn.Module):
     def mask(self, patch: int) -> Tensor | None:
         """(capacity,) which associations a touch of a patch may recall; None is all of them."""
         if self._masks is None:
-            part = torch.tensor(self._parts, device=self.origins.device)[self.origins[:, 2]]
+            part = torch.tensor(self._parts, device=self.where.device)[self.where[:, 1]]
             several = len(part.unique()) > 1
-            self._masks = [part == p if several else None for p in self._parts]
+            empty = (0, self.memory.capacity - len(part))
+            self._masks = [pad(part == p, empty) if several else None for p in self._parts]
         return self._masks[patch]
 
     def weights(self, query: Tensor, patch: int) -> Array:
-        """Weight of each association in a recall, (capacity,)."""
+        """Weight of each association in a recall, (K,)."""
         weights: Array = self.memory.weights(query, self.mask(patch)).double().cpu().numpy()
-        return weights
+        return weights[: len(self.where)]
+
+    def sureness(self, query: Tensor, patch: int) -> tuple[float, float]:
+        """Agreement of the best match with a query (D,), 0 to 1, and its lead over the second."""
+        found = self.memory.inspect(query, self.mask(patch))
+        best, lead = (float(x) / self.code_dim for x in (found.score, found.margin))
+        return min(max(best, 0.0), 1.0), lead
+
+    def confidence(self, query: Tensor, patch: int) -> float:
+        """Agreement of the best match with a query (D,), 0 to 1."""
+        return self.sureness(query, patch)[0]
 
     def recall(self, query: Tensor, touch: Touched) -> Array:
         """What a query (D,) recalls under a touch, read out, (V,)."""

@@ -15,6 +15,7 @@ class Settled:
         beta: Inverse temperature β.
         joints: Indices of the coded joints.
         moved: Indices of the joints that are moved; the others are left where they are.
+        chosen_from: Number of episodes from which it was chosen.
         moved_by: Indices of those that the touch of each taught patch moves, by its name.
         angle: Angle θ of RoPE3D, rad.
         threshold: Soft threshold τ, in the skin's unit.
@@ -40,9 +41,15 @@ class Settled:
     current_per_newton: float
     capacity: int
     taught: list[str]
+    chosen_from: int = 0
     moved_by: dict[str, list[int]] = field(default_factory=dict)
     density: list[float] = field(default_factory=lambda: [0.0, 1.0])
     observed: list[list[float]] = field(default_factory=list)
     past: list[int] = field(default_factory=list)
     flip: float = 0.0
     trend: bool = False
+
+    @property
+    def code_facts(self) -> tuple[object, ...]:
+        """What the codes and values of stored associations depend on beside what was chosen."""
+        return self.moved, self.density, self.observed

@@ -197,6 +197,23 @@ class Timed(nn.Module):
         beta = float(self.memory.beta)
         return self.read(found, self.match(found), beta, self.settled.trend)
 
+    def sureness(self, found: Moments) -> tuple[float, float]:
+        """Agreement of the best match with a moment, 0 to 1, and its lead over the second."""
+        best = self.match(found).scores[0]
+        lead = float(best[0] - best[1]) if len(best) > 1 else float("inf")
+        return min(max(float(best[0]), 0.0), 1.0), lead
+
+    def confidence(self, found: Moments) -> float:
+        """Agreement of the best match with a moment, 0 to 1."""
+        return self.sureness(found)[0]
+
+    def known(self, found: Moments) -> bool:
+        """Whether the coded joints of a moment are where the neurons are spread."""
+        coded = self.settled.joints
+        position = found.state[0, coded]
+        lower, upper = self.lower[: len(coded)], self.upper[: len(coded)]
+        return bool(((position >= lower) & (position <= upper)).all())
+
     def weights(self, found: Moments) -> np.ndarray:
         """(count,) recall weight of every association for one moment."""
         matches = self.match(found)

@@ -48,11 +48,18 @@ from hasm_torch.sim.teacher import ComplianceTeacher, GraspTeacher, Teacher, Yie
 
 Array = NDArray[np.float64]
 
+LEAD_SPEED = 0.8  # share of the joints' speed limits at which a hand leads an untouched robot
 FLEX = JOINTS.index("arm_flex_joint")
 
 
-class _Recorder:
-    """Steps the environment under one episode's touches and keeps what it saw."""
+class Recorder:
+    """Steps the environment under one episode's touches and keeps what it saw.
+
+    Args:
+        teacher: Answers the touches.
+        start: (J,) start positions of `JOINTS`, rad or m.
+        place: Displacement of the object in x and y, m.
+    """
 
     def __init__(self, teacher: Teacher, start: Array, place: Sequence[float] = (0.0, 0.0)) -> None:
         self.teacher, self.env = teacher, teacher.env
@@ -72,6 +79,15 @@ class _Recorder:
         """An even touch of a patch's middle, or rest."""
         for _ in range(round(seconds * CONTROL_RATE)):
             self.step(patch, force)
+
+    def lead(self, positions: Array) -> None:
+        """Lead the untouched robot to other positions (J,), rad or m, at `LEAD_SPEED`."""
+        way = positions - self.env.joint_position
+        speed = LEAD_SPEED * self.env.joint_speed_limit
+        count = int(np.ceil((np.abs(way) / speed).max() * CONTROL_RATE))
+        for part in np.linspace(0.0, 1.0, count + 1)[1:]:
+            self.teacher.target = positions - (1.0 - part) * way
+            self.step(None)
 
     def episode(self, index: int, task: str) -> Episode:
         """Everything seen so far."""
@@ -108,19 +124,26 @@ def yield_episodes(count: int, torso: bool, generator: np.random.Generator) -> I
     for index in range(count):
         start = random_posture(env.joint_lower, env.joint_upper, generator)
         start[base] = generator.uniform(-1.0, 1.0, 3) * (BASE_PLACE, BASE_PLACE, np.pi)
-        recorder = _Recorder(teacher, start)
+        recorder = Recorder(teacher, start)
         recorder.steps(0.1)
         for patch in generator.permutation(patches).tolist():
-            _push(recorder, teacher, patch, generator)
+            push(recorder, teacher, patch, generator)
             recorder.steps(PUSH_GAP)
         yield recorder.episode(index, YIELD_TORSO if torso else YIELD_WRIST)
     env.close()
 
 
-def _push(
-    recorder: _Recorder, teacher: YieldTeacher, patch: str, generator: np.random.Generator
+def push(
+    recorder: Recorder, teacher: YieldTeacher, patch: str, generator: np.random.Generator
 ) -> None:
-    """One trembling push of a random cell, led beside the force."""
+    """Record one trembling push of a random cell, led beside the force.
+
+    Args:
+        recorder: Of the episode.
+        teacher: Its teacher.
+        patch: Patch to push.
+        generator: Draws cell, tilt and tremor.
+    """
     env = teacher.env
     cells = env.skin.slices[patch]
     cell = int(generator.integers(cells.stop - cells.start))
@@ -173,7 +196,7 @@ def _compliance_episode(
     for straight in ("arm_roll_joint", "wrist_roll_joint"):  # so that the arm moves with the force
         start[JOINTS.index(straight)] = 0.0
     start[joint] = begin
-    recorder = _Recorder(teacher, start)
+    recorder = Recorder(teacher, start)
     recorder.steps(0.2)
     while teacher.target is not None and teacher.target[joint] != end:
         recorder.step(behaviour.patch, TEACHING_FORCE)
@@ -199,7 +222,7 @@ def grasp_episodes(
     home = np.array(START_POSES["grasp"])
     for index, place in enumerate(places):
         start = noisy_start(home, START_NOISE, env.joint_lower, env.joint_upper, generator)
-        recorder = _Recorder(teacher, start, place)
+        recorder = Recorder(teacher, start, place)
         recorder.steps(0.3)
         for patch in (REACH_PATCH, GRASP_PATCH):
             pause_at = generator.uniform(0.2, 0.8)

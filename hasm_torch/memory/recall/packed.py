@@ -1,4 +1,4 @@
-"""Softmax recall over a memory of ±1 codes, one bit an entry.
+"""Recall over a memory of ±1 codes, one bit an entry.
 
 Layout: a block holds 64 associations; ``words[block, w, row]`` is word w (32 entries, the first in
 the lowest bit) of association 64·block + row. Rows of a block lie side by side, so that one
@@ -6,12 +6,23 @@ instruction compares the same word of many associations. Entries past the code a
 memory are zero.
 """
 
+import functools
 import math
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from hasm_torch.memory.recall.dense import Recall, check_shapes, exclude, summarise
+from hasm_torch import kernels
+from hasm_torch.memory.recall.dense import (
+    Recall,
+    Stored,
+    check_shapes,
+    full_precision,
+    summarise,
+    weigh,
+)
 
 ROWS = 64  # associations in a block
 WORD = 32  # entries in a word
@@ -61,30 +72,19 @@ def store(words: Tensor, rows: Tensor, codes: Tensor) -> None:
     words[rows // ROWS, :, rows % ROWS] = _pack_codes(codes)
 
 
-def recall_packed(
-    query: Tensor,
-    words: Tensor,
-    successors: Tensor,
-    beta: float | Tensor,
-    count: Tensor | None = None,
-    mask: Tensor | None = None,
-) -> Tensor:
+def recall_packed(query: Tensor, memory: Stored) -> Tensor:
     """Recalls what followed the associations most like the query, from a packed memory.
 
         d = S₋₁ softmax(β Mᵀ q),   mᵀq = dim - 2·popcount(m xor q)
 
-    No association is approximated: scores are exact integers, weights are float32 and what is left
-    out weighs less than 2⁻⁴⁰ of the whole, for every β. The query is binarised by sign, so no
-    gradient reaches it; gradients reach β and the successors.
+    No association is approximated: scores are exact integers, and what is left out weighs less than
+    2⁻⁴⁰ of the whole, for every β. The query is binarised by sign, so no gradient reaches it;
+    gradients reach β and the successors.
 
     Args:
         query: q, (*batch, ..., dim), finite; the sign counts.
-        words: M as ``pack`` gives it, (*batch, blocks, words, 64) int32: one memory for all queries
-            without ``batch``, else a memory for each of its entries.
-        successors: S₋₁, (*batch, rows, values) with rows <= 64 * blocks, float32.
-        beta: β, a number or a () tensor.
-        count: Number of rows filled, () or (*batch,) int64; without it all rows.
-        mask: Rows each query may recall, (*batch, ..., rows) bool.
+        memory: What is recalled from, with associations as ``pack`` gives them and
+            rows <= 64 * blocks.
 
     Returns:
         Decision d, (*batch, ..., values); NaN where no row takes part.
@@ -92,79 +92,109 @@ def recall_packed(
     Raises:
         ValueError: If the shapes do not fit one another, or β is not a number.
     """
-    return _recall(query, words, successors, beta, count, mask)[0]
+    memory = _checked(query, memory)
+    if not _straight(query, memory):
+        return _recall(query, memory)[0]
+    decision = torch.empty(*query.shape[:-1], memory.successors.shape[-1])
+    _scan(query, memory, decision=decision)
+    return decision
 
 
-def inspect_packed(
-    query: Tensor,
-    words: Tensor,
-    successors: Tensor,
-    beta: float | Tensor,
-    count: Tensor | None = None,
-    mask: Tensor | None = None,
-) -> Recall:
+def inspect_packed(query: Tensor, memory: Stored) -> Recall:
     """Recalls like ``recall_packed`` and tells the best match, its margin and the entropy."""
-    decision, match, certainty = _recall(query, words, successors, beta, count, mask)
+    memory = _checked(query, memory)
+    recall = _scan_all if _straight(query, memory) else _recall
+    decision, match, certainty = recall(query, memory)
     return Recall(decision, match, *certainty.unbind(0))
 
 
-def _recall(
-    query: Tensor,
-    words: Tensor,
-    successors: Tensor,
-    beta: float | Tensor,
-    count: Tensor | None,
-    mask: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Decision, match, and score, margin and entropy stacked."""
-    batch, (blocks, width) = words.shape[:-3], words.shape[-3:-1]
-    rows = successors.shape[-2]
-    check_shapes(query, batch, blocks * ROWS, successors, mask)
+@full_precision
+def weights_packed(query: Tensor, memory: Stored) -> Tensor:
+    """The weight of every row, (*batch, ..., rows); arguments as in ``recall_packed``."""
+    memory = _checked(query, memory)
+    if not _straight(query, memory):
+        return weigh(_scores(query, memory), memory)
+    weights = torch.zeros(*query.shape[:-1], memory.successors.shape[-2])
+    _scan(query, memory, weights=weights)
+    return weights
+
+
+def _checked(query: Tensor, memory: Stored) -> Stored:
+    """The memory with β and the rows held as tensors, if it fits the query."""
+    *_, blocks, width, _ = memory.associations.shape
+    check_shapes(query, memory, memory.associations.shape[:-3], blocks * ROWS)
     if width != -(-query.shape[-1] // WORD):
         raise ValueError(
             f"expected a query of {WORD * width - WORD + 1} to {WORD * width} entries for "
             f"{width} words a code, got {query.shape[-1]}"
         )
-    if not isinstance(beta, Tensor):
-        exact = torch.float64 if query.device.type == "cpu" else torch.float32
-        beta = torch.full((), beta, dtype=exact, device=query.device)
-    if count is None:
-        count = torch.full((), rows, dtype=torch.int64, device=query.device)
-    learning = torch.is_grad_enabled() and (beta.requires_grad or successors.requires_grad)
-    if learning or successors.dtype != torch.float32:
-        return _recall_by_torch(query, words, successors, beta, count, mask)
-    return _packed_recall(query.detach(), words, successors, beta, count, mask)
+    if not isinstance(memory.beta, Tensor):
+        exact = torch.float64 if query.is_cpu else torch.float32
+        memory = memory._replace(beta=torch.tensor(memory.beta, dtype=exact, device=query.device))
+    if memory.held is None:
+        rows = torch.tensor(memory.successors.shape[-2], device=query.device)
+        memory = memory._replace(held=rows)
+    return memory
 
 
-def _recall_by_torch(
-    query: Tensor,
-    words: Tensor,
-    successors: Tensor,
-    beta: Tensor,
-    count: Tensor,
-    mask: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The same recall in torch operations: any device, and gradients for β and the successors."""
-    batch, dim, rows = words.shape[:-3], query.shape[-1], successors.shape[-2]
-    signs = _pack_codes(query).reshape(*batch, -1, words.shape[-2])
+def _compiled(memory: Stored) -> bool:
+    """Whether the compiled scan serves: it has no gradients, and float32 alone."""
+    successors, beta = memory.successors, memory.beta
+    learning = successors.requires_grad or (isinstance(beta, Tensor) and beta.requires_grad)
+    if learning and torch.is_grad_enabled():
+        return False
+    return successors.dtype == torch.float32 and kernels.enabled()
+
+
+def _straight(query: Tensor, memory: Stored) -> bool:
+    """Whether it is called without the dispatcher, which takes as long as the scan of one query."""
+    return query.is_cpu and not torch.compiler.is_compiling() and _compiled(memory)
+
+
+def _recall(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:
+    """Decision, match, and score, margin and entropy stacked."""
+    if not _compiled(memory):
+        return _by_torch(query, memory)
+    *arguments, interaction, top_k = memory
+    found: tuple[Tensor, Tensor, Tensor] = torch.ops.hasm_torch.packed_recall(
+        query.detach(), *arguments, str(interaction), top_k
+    )
+    return found
+
+
+@full_precision
+def _by_torch(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:
+    """``_recall`` in torch operations: any device, and gradients for β and the successors."""
+    recall = summarise(_scores(query, memory), query, memory)
+    return recall.decision, recall.match, torch.stack(recall[2:])
+
+
+def _scores(query: Tensor, memory: Stored) -> Tensor:
+    """Mᵀq of the signs, (*batch, ..., rows), in the successors' dtype or float32."""
+    words, rows, dim = memory.associations, memory.successors.shape[-2], query.shape[-1]
+    signs = _pack_codes(query).reshape(*words.shape[:-3], -1, words.shape[-2])
+    distances = (_distances_gpu() if words.is_cuda else _distances)(signs, words)
+    scores = (dim - 2 * distances)[..., :rows].reshape(*query.shape[:-1], rows)
+    return scores.to(torch.promote_types(memory.successors.dtype, torch.float32))
+
+
+def _distances(signs: Tensor, words: Tensor) -> Tensor:
+    """Hamming distances of packed queries (*batch, queries, width), (*batch, queries, rows)."""
     stored = words.transpose(-3, -2).flatten(-2)
     distances = torch.zeros(
-        *signs.shape[:-1], stored.shape[-1], dtype=torch.int32, device=query.device
+        *signs.shape[:-1], stored.shape[-1], dtype=torch.int32, device=words.device
     )
     for word in range(words.shape[-2]):
         differing = signs[..., :, word].unsqueeze(-1) ^ stored[..., word, :].unsqueeze(-2)
         distances += _count_ones(differing)
-    scores = (dim - 2 * distances)[..., :rows].reshape(*query.shape[:-1], rows)
-    scores = scores.to(torch.promote_types(successors.dtype, torch.float32))
-    logits = (beta * scores).masked_fill(exclude(scores, len(batch), count, mask), -torch.inf)
-    recall = summarise(scores, logits, beta, query, successors)
-    return recall.decision, recall.match, torch.stack(recall[2:])
+    return distances
 
 
 def _pack_codes(codes: Tensor) -> Tensor:
     """Codes (..., dim) as words (..., words) int32."""
     words = -(-codes.shape[-1] // WORD)
-    bits = torch.nn.functional.pad(codes >= 0, (0, words * WORD - codes.shape[-1]))
+    signs = (codes >= 0).to(torch.int32)
+    bits = torch.nn.functional.pad(signs, (0, words * WORD - codes.shape[-1]))
     shifts = torch.arange(WORD, dtype=torch.int32, device=codes.device)
     return (bits.unflatten(-1, (words, WORD)) << shifts).sum(-1, dtype=torch.int32)
 
@@ -177,93 +207,72 @@ def _count_ones(bits: Tensor) -> Tensor:
     return (bits * 0x01010101) >> 24
 
 
-_library = torch.library.Library("hasm_torch", "FRAGMENT")
-_library.define(
-    "packed_recall(Tensor query, Tensor words, Tensor successors, Tensor beta, Tensor count, "
-    "Tensor? mask) -> (Tensor decision, Tensor match, Tensor certainty)",
-    tags=(torch.Tag.pt2_compliant_tag,),
-)
-_packed_recall = torch.ops.hasm_torch.packed_recall.default
+@functools.cache
+def _distances_gpu() -> Callable[[Tensor, Tensor], Tensor]:
+    try:
+        from hasm_torch.memory.recall.packed_gpu import distances_gpu
+    except ImportError:  # no Triton on this platform
+        return _distances
+    return distances_gpu
 
 
-def _on_cpu(
-    query: Tensor,
-    words: Tensor,
-    successors: Tensor,
-    beta: Tensor,
-    count: Tensor,
-    mask: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
+@functools.cache
+def _scan_cpu() -> Callable[..., None]:
+    """The compiled scan; numba loads in about 0.5 s."""
     from hasm_torch.memory.recall.packed_cpu import scan_cpu
 
-    value = beta.item()
+    return scan_cpu
+
+
+def _scan(query: Tensor, memory: Stored, **wanted: Any) -> None:
+    """Runs the scan on the CPU for the results wanted; see ``scan_cpu``."""
+    words, successors, beta, held, mask, interaction, top_k = memory
+    value = float(beta)
     if math.isnan(value):
         raise ValueError("expected beta to be a number, got NaN")
     if query.dtype != torch.float32:
         query = torch.where(query >= 0, 1.0, -1.0)
-    if count.shape != words.shape[:-3]:
-        count = count.expand(words.shape[:-3])
-    return scan_cpu(
-        query.contiguous(),
-        words.contiguous(),
-        successors.contiguous(),
-        value,
-        count.contiguous(),
-        None if mask is None else mask.contiguous(),
-    )
+    if held is not None and held.ndim != words.ndim - 3:
+        held = held.expand(words.shape[:-3])
+    tensors = [t if t is None else t.contiguous() for t in (query, words, successors, held, mask)]
+    _scan_cpu()(*tensors, value, interaction, top_k, **wanted)
 
 
-def _on_gpu(
-    query: Tensor,
-    words: Tensor,
-    successors: Tensor,
-    beta: Tensor,
-    count: Tensor,
-    mask: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    try:
-        from hasm_torch.memory.recall.packed_gpu import scan_gpu
-    except ImportError:  # no Triton on this platform
-        return _recall_by_torch(query, words, successors, beta, count, mask)
-
-    batch, leading = words.shape[:-3], query.shape[:-1]
-    beta = beta.to(query.device)
-    # With a negative beta the farthest row counts; the complement makes it the nearest.
-    signs = _pack_codes(torch.where((query >= 0) == (beta >= 0), 1, -1))
-    with torch.cuda.device(query.device):
-        decision, match, certainty = scan_gpu(
-            signs.reshape(*batch, -1, signs.shape[-1]),
-            words.contiguous(),
-            successors.contiguous(),
-            beta,
-            count.expand(batch).contiguous(),
-            None if mask is None else mask.reshape(*batch, -1, mask.shape[-1]).contiguous(),
-            query.shape[-1],
-        )
-    return (
-        decision.reshape(*leading, -1),
-        match.reshape(leading),
-        certainty.reshape(3, *leading),
-    )
+def _scan_all(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:
+    """``_recall`` by the scan on the CPU."""
+    decision, match, certainty = _room(query, memory)
+    _scan(query, memory, decision=decision, match=match, certainty=certainty)
+    return decision, match, certainty
 
 
-def _shapes_only(
-    query: Tensor,
-    words: Tensor,
-    successors: Tensor,
-    beta: Tensor,
-    count: Tensor,
-    mask: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    leading, values = query.shape[:-1], successors.shape[-1]
-    return (
-        successors.new_empty(*leading, values),
-        count.new_empty(leading),
-        successors.new_empty(3, *leading),
-    )
+def _room(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:
+    """Empty tensors like those that ``_recall`` returns."""
+    leading, values = query.shape[:-1], memory.successors
+    match = torch.empty(leading, dtype=torch.int64, device=query.device)
+    return values.new_empty(*leading, values.shape[-1]), match, values.new_empty(3, *leading)
 
 
-_library.impl("packed_recall", _on_cpu, "CPU")
-_library.impl("packed_recall", _on_gpu, "CUDA")
-_library.impl("packed_recall", _recall_by_torch, "CompositeExplicitAutograd")
-torch.library.register_fake("hasm_torch::packed_recall", _shapes_only, lib=_library)
+def _operator(recall: Callable[[Tensor, Stored], tuple[Tensor, Tensor, Tensor]]) -> Any:
+    """A form of ``_recall`` as an operator that ``torch.compile`` and ``torch.export`` keep whole.
+
+    An operator is told the interaction as a string.
+    """
+
+    def run(query: Tensor, *memory: Any) -> tuple[Tensor, Tensor, Tensor]:
+        told = Stored(*memory)
+        name = str(told.interaction)
+        return recall(query, told._replace(interaction=int(name)) if name.isdecimal() else told)
+
+    return run
+
+
+_library = torch.library.Library("hasm_torch", "FRAGMENT")
+_library.define(
+    "packed_recall(Tensor query, Tensor words, Tensor successors, Tensor beta, Tensor held, "
+    "Tensor? mask, str interaction, int? top_k) "
+    "-> (Tensor decision, Tensor match, Tensor certainty)",
+    tags=(torch.Tag.pt2_compliant_tag,),
+)
+_library.impl("packed_recall", _operator(_scan_all), "CPU")
+_library.impl("packed_recall", _operator(_by_torch), "CompositeExplicitAutograd")
+torch.library.register_fake("hasm_torch::packed_recall", _operator(_room), lib=_library)

@@ -1,0 +1,98 @@
+"""``touch.py``, ``hasm-touch``: teach the simulated HSR by hand in a browser."""
+
+import sys
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from hasm_torch.apps.command_line import parse_options
+from hasm_torch.config import HASMConfig
+from hasm_torch.model.hasm import HASM
+from hasm_torch.sim.scene import SCENES
+from hasm_torch.touch.page import Page
+from hasm_torch.touch.session import Session
+from hasm_torch.touch.shelf import Shelf
+from hasm_torch.touch.simulated import body_in, check_body
+
+# How long a thread keeps Python to itself, s: physics and recall give it away many times a control
+# step, and the page's threads would hand it back after 5 ms each time.
+SWITCH_INTERVAL = 0.0005
+
+
+@dataclass
+class TouchConfig:
+    """Options of ``touch.py``.
+
+    Attributes:
+        teach: What the robot knows at the start: "bundled" teaching of the scene, or "empty".
+        checkpoint: Directory written by ``train.py`` or saved on the page, known in place of that.
+        scene: "compliance", the robot alone, or "grasp", with a table and an object.
+        datasets: Folder of the bundled datasets.
+        model: Settings of the method, where the robot starts empty; by default a touch moves it,
+            never time alone.
+        output_dir: Folder of what is saved on the page.
+        seed: Seed of what resets draw.
+        host: Address to listen at: only this machine can reach the default one.
+        port: Port to listen at; the next free one where it is taken.
+    """
+
+    teach: Literal["bundled", "empty"] = "bundled"
+    checkpoint: Path | None = None
+    scene: str = "compliance"
+    datasets: Path = Path("datasets")
+    model: HASMConfig = field(default_factory=lambda: HASMConfig(drive="spike"))
+    output_dir: Path = Path("outputs/touch")
+    seed: int = 0
+    host: str = "127.0.0.1"
+    port: int = 8080
+
+    def __post_init__(self) -> None:
+        if self.scene not in SCENES:
+            raise ValueError(f"scene must be one of {SCENES}, got {self.scene!r}")
+        if not 0 <= self.port < 65536:
+            raise ValueError(f"port must be 0 to 65535, got {self.port}")
+
+
+def open_session(config: TouchConfig) -> Session:
+    """A session with what the options ask for; it is not started yet.
+
+    Raises:
+        FileNotFoundError: There is no checkpoint.
+        ValueError: It does not fit the robot or the scene.
+    """
+    model = HASM(config.model, body_in(config.scene))
+    if config.checkpoint is not None:
+        model = HASM.from_pretrained(config.checkpoint)
+        check_body(model.body, config.scene)
+    session = Session(config.scene, model, Shelf(config.output_dir), config.seed)
+    if config.checkpoint is None and config.teach == "bundled":
+        session.load_bundled(config.datasets)
+    return session
+
+
+def main() -> None:
+    """Open the page and serve it until the program is ended."""
+    config = parse_options(TouchConfig)
+    torch.set_num_threads(1)  # a control step's tensors are too small to share between threads
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    try:
+        session = open_session(config)
+        page = Page(session, config.host, config.port)
+    except (OSError, ValueError) as error:
+        sys.exit(f"touch.py: {error}")
+    session.start()
+    print(f"open {page.address} in a browser; Ctrl-C ends it")
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("ending")
+    finally:
+        page.close()
+        session.close()
+
+
+if __name__ == "__main__":
+    main()
