@@ -50,6 +50,9 @@ class Stage:
         self._figure = Figure(model)
         self._frame = 0
         self._drawn: dict[str, list[Pose]] = {}
+        # An environment map takes nearly all the time of drawing where no graphics card helps.
+        self._scene.configure_environment_map(None)
+        self._scene.add_light_hemisphere("/sky", ground_color=(190, 190, 195), intensity=2.2)
         self._scene.configure_default_lights(cast_shadow=False)
         self._scene.add_grid("/floor", width=6.0, height=6.0, cell_size=0.25, section_size=1.0)
         self._frames = {"": self._add_frames("/robot")}
