@@ -1,7 +1,6 @@
 """``touch.py``, ``hasm-touch``: teach the simulated HSR by hand in a browser."""
 
 import sys
-import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -12,13 +11,13 @@ from hasm_torch.apps.command_line import parse_options
 from hasm_torch.config import HASMConfig
 from hasm_torch.model.hasm import HASM
 from hasm_torch.sim.scene import SCENES
-from hasm_torch.touch.page import Page
+from hasm_torch.touch.link import PageProcess
 from hasm_torch.touch.session import Session
 from hasm_torch.touch.shelf import Shelf
 from hasm_torch.touch.simulated import body_in, check_body
 
 # How long a thread keeps Python to itself, s: physics and recall give it away many times a control
-# step, and the page's threads would hand it back after 5 ms each time.
+# step, and what learns beside them would hand it back after 5 ms each time.
 SWITCH_INTERVAL = 0.0005
 
 
@@ -80,13 +79,13 @@ def main() -> None:
     sys.setswitchinterval(SWITCH_INTERVAL)
     try:
         session = open_session(config)
-        page = Page(session, config.host, config.port)
+        page = PageProcess(session, config.host, config.port)
     except (OSError, ValueError) as error:
         sys.exit(f"touch.py: {error}")
     session.start()
-    print(f"open {page.address} in a browser; Ctrl-C ends it")
+    print(f"open {page.address} in a browser; Ctrl-C ends it", flush=True)
     try:
-        threading.Event().wait()
+        page.wait()
     except KeyboardInterrupt:
         print("ending")
     finally:

@@ -12,6 +12,7 @@ from hasm_torch.sim.scene import FINGERS
 Array = NDArray[np.float64]
 
 SIDES = 20  # of what is drawn for a cylinder
+_AROUND = 0.002  # m of a ghost around the robot: surfaces in the same place would flicker
 _SHOWN = (0, 1)  # geom groups; 3 holds the shapes that collide
 _WHEEL = np.linspace(0.0, 2.0 * np.pi, SIDES, endpoint=False)
 
@@ -91,7 +92,7 @@ class Figure:
     def shadow(self, colour: tuple[int, int, int]) -> list[Part]:
         """The robot alone in one colour, a part a body."""
         return [
-            self._part(body, colour, [g for geoms in colours.values() for g in geoms])
+            self._part(body, colour, [g for geoms in colours.values() for g in geoms], _AROUND)
             for body, colours in self._shapes.items()
             if body not in ("world", "object")
         ]
@@ -133,14 +134,16 @@ class Figure:
             moved[address[follower]] = polynomial[0] + polynomial[1] * moved[address[leader]]
         return self.poses(moved)
 
-    def _part(self, body: str, colour: tuple[int, int, int], geoms: list[int]) -> Part:
+    def _part(
+        self, body: str, colour: tuple[int, int, int], geoms: list[int], around: float = 0.0
+    ) -> Part:
         vertices, faces, count = [], [], 0
         root = self._model.body(body).id
         origin, frame = self._data.xpos[root], self._data.xmat[root].reshape(3, 3)
         mujoco.mj_kinematics(self._model, self._data)
         for geom in geoms:
             corners, triangles = _shape(
-                int(self._model.geom_type[geom]), self._model.geom_size[geom]
+                int(self._model.geom_type[geom]), self._model.geom_size[geom] + around
             )
             rotation = self._data.geom_xmat[geom].reshape(3, 3)
             world = corners @ rotation.T + self._data.geom_xpos[geom]

@@ -7,17 +7,18 @@ browser ◄──scene, charts, controls── Page ◄──snapshots───�
 import contextlib
 import io
 import threading
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import viser
 
+from hasm_torch.sim.env import HSRTouchEnv
 from hasm_torch.touch.charts import because, felt
 from hasm_torch.touch.history import Snapshot
 from hasm_torch.touch.lesson import SHOWN_REASONS
 from hasm_torch.touch.panel import Panel
 from hasm_torch.touch.seat import Seat
-from hasm_torch.touch.session import Session
+from hasm_torch.touch.shelf import Shelf
 from hasm_torch.touch.stage import Stage
 
 FRAMES = 20  # a second, of the scene
@@ -25,6 +26,20 @@ CHARTS_EVERY, CONTROLS_EVERY = 5, 4  # frames
 _SIDE = 300  # pixels, of the panels left and right
 _EYE, _LOOKED_AT = (1.15, -1.05, 1.15), (0.22, 0.0, 0.68)  # m
 _RANKS = (*(str(rank + 1) for rank in range(SHOWN_REASONS)), "off")
+
+
+class Shown(Protocol):
+    """A session as a page needs it, wherever it runs."""
+
+    scene: str
+    shelf: Shelf
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """The newest moment."""
+
+    def send(self, command: str, *arguments: Any) -> None:
+        """Put a command in its queue."""
 
 
 class LocalServer(viser.ViserServer):
@@ -48,13 +63,13 @@ class Page:
         port: Port to listen at; the next free one where it is taken.
     """
 
-    def __init__(self, session: Session, host: str = "127.0.0.1", port: int = 8080) -> None:
+    def __init__(self, session: Shown, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.session, self.seat = session, Seat()
         with contextlib.redirect_stdout(io.StringIO()):  # the address is told once, by whoever asks
             self._server = LocalServer(host, port, label="HASM: teach by touch", verbose=False)
         self.address = f"http://{host}:{self._server.get_port()}"
-        env = session.lesson.env
-        self._stage = Stage(self._server, env.model, env.skin)
+        self._env = HSRTouchEnv(session.scene)  # its shapes and limits; it is never stepped
+        self._stage = Stage(self._server, self._env.model, self._env.skin)
         self._panels: dict[int, Panel] = {}
         self._look()
         self._charts()
@@ -123,8 +138,8 @@ class Page:
                 client.gui,
                 lambda command, *arguments: self._send(page, command, *arguments),
                 lambda: self._take(page),
-                self.session.lesson.env,
-                self.session.learner.shelf,
+                self._env,
+                self.session.shelf,
             )
 
         @self._server.on_client_disconnect
@@ -154,8 +169,9 @@ class Page:
         self.seat.take(page)
 
     def _draw(self) -> None:
-        frame = 0
-        while not self._ending.wait(1 / FRAMES):
+        frame, snapshot = 0, self.session.snapshot
+        # The control loop goes first: while it falls behind, half as much is drawn.
+        while not self._ending.wait((1 + snapshot.behind) / FRAMES):
             snapshot = self.session.snapshot
             with self._server.atomic():
                 self._stage.draw(snapshot)
@@ -169,7 +185,7 @@ class Page:
             frame += 1
 
     def _draw_charts(self, snapshot: Snapshot) -> None:
-        env = self.session.lesson.env
+        env = self._env
         drawn = felt(snapshot, env.skin.patches, env.joint_lower, env.joint_upper)
         why = because(snapshot.why, snapshot.known)
         for handle, content in ((self._felt, drawn), (self._why, why)):

@@ -20,7 +20,9 @@ from numpy.typing import NDArray
 
 from hasm_torch.episode import Episode
 from hasm_torch.model.hasm import HASM
+from hasm_torch.robot import JOINTS
 from hasm_torch.sim.env import HSRTouchEnv
+from hasm_torch.sim.tasks import BASE_JOINTS
 from hasm_torch.touch.history import Arrow, Snapshot, Why
 from hasm_torch.touch.learner import Learner, Outcome
 from hasm_torch.touch.lesson import Lesson
@@ -39,6 +41,8 @@ class Session:
     """A lesson that runs, for any number of pages.
 
     Attributes:
+        scene: "compliance" or "grasp".
+        shelf: Where things are saved.
         learner: Learns, saves and loads beside the control loop.
 
     Args:
@@ -49,6 +53,7 @@ class Session:
     """
 
     def __init__(self, scene: str, model: HASM, shelf: Shelf, seed: int = 0) -> None:
+        self.scene, self.shelf = scene, shelf
         self.lesson = Lesson(HSRTouchEnv(scene), copy.deepcopy(model), seed)
         self.pace = Pace()
         self._inbox: queue.SimpleQueue[tuple[str, tuple[Any, ...]]] = queue.SimpleQueue()
@@ -194,8 +199,9 @@ class Session:
         lesson, env = self.lesson, self.lesson.env
         mode = "record" if lesson.recording else "play" if lesson.replay else "live"
         ghosts = dict(lesson.ghosts)
-        if self._posture is not None:
-            ghosts[POSTURE] = self._posture
+        if self._posture is not None:  # where the base was then is of no interest
+            base = np.isin(JOINTS, BASE_JOINTS)
+            ghosts[POSTURE] = np.where(base, env.joint_position, self._posture)
         busy = self.learner.busy
         return Snapshot(
             mode=mode,
