@@ -1,6 +1,9 @@
 """The page in a real browser: headless Chromium pushes, records, keeps, plays, forgets, saves."""
 
 import shutil
+import signal
+import subprocess
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -39,6 +42,7 @@ FLAGS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 ]
+ROOT = Path(__file__).parents[1]
 PATIENCE = 25.0  # s, of a test that waits for what never comes
 
 
@@ -279,6 +283,22 @@ def test_what_is_no_page_harms_nothing(come, served):
     me.until(lambda: me.now.arrows)
     assert "You drive" in me.page.locator(".seat").inner_text()
     assert served._server.request_share_url() is None
+
+
+def test_the_command_serves_its_page(browser, tmp_path):
+    options = ["--teach=empty", "--port=8795", f"--output_dir={tmp_path}"]
+    program = [sys.executable, str(ROOT / "touch.py"), *options]
+    with subprocess.Popen(program, cwd=ROOT, stdout=subprocess.PIPE, text=True) as running:
+        line = running.stdout.readline()
+        assert "http://127.0.0.1:8795" in line
+        page = browser.new_page(device_scale_factor=0.25)
+        page.goto("http://127.0.0.1:8795")
+        page.wait_for_selector(".mode")
+        page.keyboard.press("u")
+        page.wait_for_function("document.querySelector('.spikes')?.dataset.count > 10")
+        page.close()
+        running.send_signal(signal.SIGINT)
+        assert running.wait(PATIENCE) == 0
 
 
 def test_it_listens_to_this_machine_alone(served):

@@ -1,5 +1,7 @@
 """How long control steps take, and whether they keep up with real time."""
 
+import contextlib
+import os
 import time
 from collections import deque
 
@@ -10,6 +12,16 @@ from hasm_torch.sim.env import CONTROL_RATE
 PERIOD = 1 / CONTROL_RATE  # s
 REMEMBERED = 500  # steps, the last ten seconds
 SHARE = 0.99  # of the steps: what they take at most is what counts
+
+
+def come_first() -> None:
+    """Ask the system to run this thread before others; it does where its user may ask for that.
+
+    A browser that draws without a graphics card has more threads than a small machine has cores.
+    """
+    if hasattr(os, "sched_setscheduler"):  # Linux
+        with contextlib.suppress(PermissionError):
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
 class Pace:

@@ -26,7 +26,7 @@ from hasm_torch.sim.tasks import BASE_JOINTS
 from hasm_torch.touch.history import Arrow, Snapshot, Why
 from hasm_torch.touch.learner import Learner, Outcome
 from hasm_torch.touch.lesson import Lesson
-from hasm_torch.touch.pace import Pace
+from hasm_torch.touch.pace import Pace, come_first
 from hasm_torch.touch.pointing import Ray
 from hasm_torch.touch.shelf import Shelf
 
@@ -130,6 +130,7 @@ class Session:
             self._snapshot = self._look_around()
 
     def _run(self) -> None:
+        come_first()
         while not self._ending.is_set():
             self.pace.begin()
             self.step()

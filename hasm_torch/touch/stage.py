@@ -72,13 +72,15 @@ class Stage:
         self._lit: Array = np.zeros(skin.cells)
         self._arrows = [self._add_arrow(finger) for finger in FINGERS]
         self._roots: dict[str, Any] = {}
+        self._shadows: dict[str, dict[int, Any]] = {}
         for name, colour in GHOSTS.items():
             self._add_ghost(name, colour)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Show a moment."""
         self._frame += 1
-        self._move("", self._figure.poses(snapshot.qpos))
+        poses = self._figure.poses(snapshot.qpos)
+        self._move("", poses)
         if not np.allclose(self._lit, snapshot.cells, atol=0.02):
             self._lit = snapshot.cells
             for patch, cells in zip(self._cells.patches, self._patches):
@@ -86,15 +88,27 @@ class Stage:
                 cells.batched_colors = np.asarray(colours(force), dtype=np.uint8)
         self._draw_arrows(snapshot.arrows)
         if self._frame % GHOSTS_EVERY == 0:
-            self._draw_ghosts(snapshot)
+            self._draw_ghosts(snapshot, poses)
 
-    def _draw_ghosts(self, snapshot: Snapshot) -> None:
+    def _draw_ghosts(self, snapshot: Snapshot, robot: list[Pose]) -> None:
+        """Show of every ghost the parts that are elsewhere than the robot's."""
         for name, root in self._roots.items():
             joints = snapshot.ghosts.get(name)
             away = joints is not None and np.abs(joints - snapshot.state).max() > _TELLING
             root.visible = bool(away)
-            if joints is not None and away:
-                self._move(name, self._figure.poses_at(joints, snapshot.qpos))
+            if joints is None or not away:
+                continue
+            poses = self._figure.poses_at(joints, snapshot.qpos)
+            self._move(name, poses)
+            apart: list[bool] = []
+            for i, (pose, here) in enumerate(zip(poses, robot)):
+                parent = self._figure.parents[i]
+                turned = np.abs(pose.orientation - here.orientation).max() > _TELLING / 2
+                moved = turned or np.abs(pose.position - here.position).max() > _TELLING / 2
+                apart.append(bool(moved) or (parent < i and apart[parent]))
+            for body, shape in self._shadows[name].items():
+                if shape.visible != apart[body]:
+                    shape.visible = apart[body]
 
     def _add_frames(self, root: str) -> list[Any]:
         bodies = self._figure.bodies
@@ -115,8 +129,10 @@ class Stage:
         self._frames[name] = self._add_frames(root)
         hand = self._path(root, "wrist_roll_link")
         self._scene.add_label(f"{hand}/tag", name, anchor="bottom-center")
+        self._shadows[name] = {}
         for part in self._figure.shadow(colour):
-            self._scene.add_mesh_simple(
+            index = self._figure.bodies.index(part.body)
+            self._shadows[name][index] = self._scene.add_mesh_simple(
                 f"{self._path(root, part.body)}/shape",
                 part.vertices,
                 part.faces,
