@@ -22,6 +22,7 @@ from hasm_torch.sim.tasks import (
     COMPLIANCE_EPISODES,
     FAR,
     NEAR,
+    OBJECT_ENTRIES,
     OBJECT_PLACES,
     PUSH_SECONDS,
     PUSH_TILT,
@@ -83,7 +84,6 @@ CARDS = {
         ),
     },
 }
-OBJECT = {"object_x": "m", "object_y": "m", "object_z": "m"}
 
 
 @dataclass
@@ -139,7 +139,7 @@ def teach(root: Path, seed: int, names: Collection[str] = tuple(CARDS)) -> None:
             skin=skin_patches(Skin.load()),
             fps=CONTROL_RATE,
             robot_type="hsr",
-            observations={ENVIRONMENT: OBJECT} if name == "hsr_grasp" else None,
+            observations={ENVIRONMENT: OBJECT_ENTRIES} if name == "hsr_grasp" else None,
             overwrite=True,
         )
         card = CARDS[name] | {"command": f"{command} --teach_seed={seed}"}

@@ -122,8 +122,14 @@ def warm_up() -> None:
     """Import and compile what training uses, once a process, so that it is not timed."""
     import pyarrow.parquet  # noqa: F401
 
-    body = Body(["joint"], [0.0], [1.0], [1.0], ["patch"], [1], [[1.0, 0.0, 0.0]])
+    turn = [*np.eye(3).ravel().tolist(), 0.0, 0.0, 1.0, 0.0, 1.0, 0.0]  # about z, by the joint
+    body = Body(
+        *(["joint"], [0.0], [1.0], [1.0]),
+        *(["patch"], [1], [[1.0, 0.0, 0.0]]),
+        links=["link"],
+        chains={"link": [turn]},
+    )
     way = np.linspace(0.2, 0.8, 20, dtype=np.float32)[:, None]
     touch = np.full((20, 1, 3), 3.0, np.float32)
     episodes = [Episode(i, "", np.arange(20) / body.rate, way, way, touch) for i in range(2)]
-    HASM(HASMConfig(), body).fit(episodes)
+    HASM(HASMConfig(drive="spike"), body).fit(episodes)

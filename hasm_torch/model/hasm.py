@@ -158,7 +158,7 @@ class HASM(nn.Module):
             self._put(learned(*parts, episode))
         number = self.lessons.next - 1
         self.lessons.known[number].name = name or f"episode {number}"
-        return self.known(number)
+        return self.episodes[-1]
 
     @torch.no_grad()
     def forget(self, number: int) -> None:
@@ -183,18 +183,23 @@ class HASM(nn.Module):
             parts = self.config, self.body, self.settled, self._learned(), self.lessons
             self._put(forgotten(*parts, number))
 
-    def known(self, number: int) -> Known:
-        """What is known of an episode, by its number."""
-        lesson = self.lessons.known[number]
-        touched = sorted({int(p) for p in lesson.phases.patch})
-        count = int((self.origins[:, 0] == number).sum())
-        names = [self.body.patches[p] for p in touched]
-        return Known(number, lesson.name, lesson.seconds, count, names)
-
     @property
     def episodes(self) -> list[Known]:
         """The episodes that are known, in the order in which they were learned."""
-        return [self.known(number) for number in self.lessons.known]
+        if self.recalling is None:
+            return []
+        numbers, counts = np.unique(self.origins[:, 0], return_counts=True)
+        held = dict(zip(numbers.tolist(), counts.tolist()))
+        return [
+            Known(
+                lesson.number,
+                lesson.name,
+                lesson.seconds,
+                held.get(lesson.number, 0),
+                [self.body.patches[p] for p in sorted(lesson.travel)],
+            )
+            for lesson in self.lessons
+        ]
 
     def explain(self, rollout: Rollout | None = None) -> list[Explanation]:
         """Why the last step moved the robot, one explanation a recall; none without a recall.
@@ -210,8 +215,8 @@ class HASM(nn.Module):
             moment = rollout.moment
             return [] if moment is None else [explained_moment(recalling, moment, self.body.rate)]
         assert self.settled is not None
-        learned = self.config, self.body, self.settled, recalling
-        return [explained(*learned, asked, self._made_of()) for asked in rollout.asked]
+        parts = self.config, self.body, self.settled, recalling
+        return [explained(*parts, asked, self._made_of()) for asked in rollout.asked]
 
     def posture(self, row: int) -> Array:
         """(joints,) positions at which an association was made, rad or m."""

@@ -106,7 +106,7 @@ class QueryCode(nn.Module):
             rank.numpy(),
             self.keys.numpy(),
             phases if self.angle else phases[:0],
-            mixing.numpy(),
+            mixing.contiguous().numpy(),
         )
 
     def forward(
@@ -136,12 +136,13 @@ class QueryCode(nn.Module):
         self.place_code.check(mine)
         more = self._observation_code(observation)
         if kernels.enabled() and mine.device.type == "cpu":
+            # Contiguous, since another layout would be compiled for itself.
             coded = passes.encode_queries(
                 self._tables,
-                mine.detach().double().numpy(),
-                density.detach().double().numpy(),
+                mine.detach().double().contiguous().numpy(),
+                density.detach().double().contiguous().numpy(),
                 self.parts[patch].numpy(),
-                direction.detach().double().numpy(),
+                direction.detach().double().contiguous().numpy(),
                 self._no_code if more is None else more.numpy(),
             )
             return torch.from_numpy(coded)

@@ -47,6 +47,7 @@ from hasm_torch.sim.tasks import (
 from hasm_torch.sim.teacher import ComplianceTeacher, GraspTeacher, Teacher, YieldTeacher
 
 Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
 
 LEAD_SPEED = 0.8  # share of the joints' speed limits at which a hand leads an untouched robot
 FLEX = JOINTS.index("arm_flex_joint")
@@ -65,7 +66,7 @@ class Recorder:
         self.teacher, self.env = teacher, teacher.env
         self.observation, _ = self.env.reset(seed=0, options={"joints": start, "object": place})
         teacher.reset()
-        self.rows: list[tuple[NDArray[np.float32], ...]] = []
+        self.rows: list[tuple[Array32, ...]] = []
 
     def step(self, patch: str | None, force: float = 0.0, cell: int | None = None) -> None:
         """One control step."""
@@ -91,16 +92,28 @@ class Recorder:
 
     def episode(self, index: int, task: str) -> Episode:
         """Everything seen so far."""
-        state, action, skin, *bound = (np.array(column) for column in zip(*self.rows))
-        return Episode(
-            index=index,
-            task=task,
-            time=np.arange(len(state)) / CONTROL_RATE,
-            state=state,
-            action=action,
-            tactile=skin.reshape(len(state), -1, 3),
-            observations=bound[0] if bound else None,
-        )
+        return episode_of(self.rows, index, task)
+
+
+def episode_of(rows: Sequence[tuple[Array32, ...]], index: int, task: str) -> Episode:
+    """An episode of the control steps that a demonstration took.
+
+    Args:
+        rows: State (J,), target (J,), skin (cells * 3,) and, where more is bound, that (N,), of
+            each step.
+        index: Number of the episode.
+        task: What is done, in words.
+    """
+    state, action, skin, *bound = (np.array(column) for column in zip(*rows))
+    return Episode(
+        index=index,
+        task=task,
+        time=np.arange(len(state)) / CONTROL_RATE,
+        state=state,
+        action=action,
+        tactile=skin.reshape(len(state), -1, 3),
+        observations=bound[0] if bound else None,
+    )
 
 
 def yield_episodes(count: int, torso: bool, generator: np.random.Generator) -> Iterator[Episode]:

@@ -122,6 +122,9 @@ def _grid(side: int, reach: float) -> tuple[tuple[float, float], ...]:
 # Displacements (x, y) of the object in the demonstrations: nine, then sixteen.
 OBJECT_PLACES = _grid(3, NEAR) + _grid(4, FAR)
 
+OBJECT_ENTRIES = {"object_x": "m", "object_y": "m", "object_z": "m"}
+"""Names and units of the object's position, as datasets bind it."""
+
 TASKS = {behaviour.name: behaviour.task for behaviour in BEHAVIOURS} | {
     "grasp": GRASP,
     "yield": YIELD_WRIST,

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hasm_torch.episode import Episode
 from hasm_torch.robot import Skin
+from hasm_torch.sim.demonstrator import episode_of
 from hasm_torch.sim.env import CONTROL_RATE, LARGEST_FORCE
 from hasm_torch.sim.scene import FINGERS
 
@@ -35,8 +36,8 @@ class Recorder:
 
     def add(self, observation: Mapping[str, NDArray[np.float32]], target: Array) -> None:
         """Take in one control step: what was seen, and where the joints were then led."""
-        seen = [np.array(values) for values in observation.values()]
-        self._rows.append((np.asarray(target, dtype=np.float32), *seen))
+        state, *seen = [np.array(values) for values in observation.values()]
+        self._rows.append((state, np.asarray(target, dtype=np.float32), *seen))
 
     def episode(self, index: int, task: str) -> Episode:
         """Everything recorded so far.
@@ -46,16 +47,7 @@ class Recorder:
         """
         if not self._rows:
             raise ValueError("nothing was recorded: record a demonstration first")
-        action, state, skin, *more = (np.array(column) for column in zip(*self._rows))
-        return Episode(
-            index=index,
-            task=task,
-            time=np.arange(len(state)) / CONTROL_RATE,
-            state=state,
-            action=action,
-            tactile=skin.reshape(len(state), -1, 3),
-            observations=more[0] if more else None,
-        )
+        return episode_of(self._rows, index, task)
 
 
 @dataclass

@@ -10,17 +10,17 @@ from hasm_torch.data.skin import skin_patches
 from hasm_torch.episode import ENVIRONMENT, Episode
 from hasm_torch.robot import JOINTS, METRES, Skin
 from hasm_torch.sim.env import CONTROL_RATE
+from hasm_torch.sim.tasks import OBJECT_ENTRIES
 
 BUNDLED = {"compliance": "hsr_yield", "grasp": "hsr_grasp"}
 """The bundled teaching of each scene, a dataset."""
 
 UNITS = tuple("m" if joint in METRES else "rad" for joint in JOINTS)
-_OBJECT = {"object_x": "m", "object_y": "m", "object_z": "m"}
 
 
 def bound_in(scene: str) -> dict[str, dict[str, str]]:
     """Entries and units of what is bound besides joints and skin in a scene, by feature."""
-    return {ENVIRONMENT: _OBJECT} if scene == "grasp" else {}
+    return {ENVIRONMENT: OBJECT_ENTRIES} if scene == "grasp" else {}
 
 
 def body_in(scene: str) -> Body:
