@@ -138,8 +138,13 @@ def teach(*sessions: dict[str, Any]) -> str:
         ["time of learning, all lessons", *(f"{found['learned_s']:.2f} s" for found in sessions)],
         [
             "unseen pushes with cos > 0.7, of the hand's own",
-            *(f"{found['tested']['share_07_of_teacher']:.0%}" for found in sessions),
+            *_shares_taught(sessions, "memory"),
         ],
+        *(
+            [f"the same, {name}", *_shares_taught(sessions, name)]
+            for name in sessions[0]["tested"]
+            if name != "memory"
+        ),
         [
             "weight of a lesson in its own posture, before and after forgetting it",
             *(
@@ -154,6 +159,10 @@ def teach(*sessions: dict[str, Any]) -> str:
         ],
     ]
     return markdown(("", "lessons of a dozen pushes", "single pushes"), rows)
+
+
+def _shares_taught(sessions: Sequence[dict[str, Any]], name: str) -> list[str]:
+    return [f"{found['tested'][name]['share_07_of_teacher']:.0%}" for found in sessions]
 
 
 def skin_filter(measured: dict[str, Any]) -> str:

@@ -46,6 +46,7 @@ CONTESTANTS = {
     "argmax": replace(MEAN, beta=float("inf")),
     "nearest stored sample": MEAN,
     "RoPE3D off": replace(MEAN, rope=False),
+    "first order, RoPE3D off": replace(MEAN, readout="first_order", rope=False),
     "rotation constant a patch": replace(MEAN, frame="link"),
     "random key a patch": replace(MEAN, rope=False, touch="patch"),
 }

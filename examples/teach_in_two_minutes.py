@@ -11,7 +11,7 @@ benchmarks/results/teach_in_two_minutes.json, a video to docs/.
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from hasm_torch.apps.command_line import parse_options
 from hasm_torch.episode import Episode
 from hasm_torch.evaluation import along_force, yielding
 from hasm_torch.evaluation.grasp import GraspCase
-from hasm_torch.evaluation.rollout import run_case
+from hasm_torch.evaluation.rollout import Policy, run_case
 from hasm_torch.evaluation.video import Frame, caption, write_video
 from hasm_torch.sim.demonstrator import Recorder, grasp_episodes, push
 from hasm_torch.sim.env import CONTROL_RATE, HSRTouchEnv
@@ -96,15 +96,31 @@ def taught(model: HASM, episodes: list[Episode]) -> list[float]:
     return seconds
 
 
-def tested(env: HSRTouchEnv, model: HASM, options: Options) -> dict[str, Any]:
+def tested(
+    env: HSRTouchEnv, models: dict[str, HASM], options: Options
+) -> dict[str, dict[str, Any]]:
     """Unseen pushes from unseen postures, beside the hand's own law on the same pushes."""
     planned = yielding.cases(options.tested, options.seed + 1000, kinds=("even",))
     cases = [case.without_rest() for case in planned]
-    teacher = YieldTeacher(env)
-    mine, own = (
-        [run_case(case, env, policy)[1]["motion"] for case in cases] for policy in (model, teacher)
-    )
-    return along_force.summarise(mine, own)
+
+    def motions(policy: Policy) -> list[along_force.Motion]:
+        return [run_case(case, env, policy)[1]["motion"] for case in cases]
+
+    own = motions(YieldTeacher(env))
+    return {name: along_force.summarise(motions(model), own) for name, model in models.items()}
+
+
+def controls(model: HASM, episodes: list[Episode], body: Body) -> dict[str, HASM]:
+    """The same lessons with a part of the method replaced by something simpler."""
+    without = {
+        "RoPE3D off": replace(TAUGHT_BY_TOUCH, rope=False, touch="direction"),
+        "the patch alone": replace(TAUGHT_BY_TOUCH, touch="patch", value="displacement"),
+    }
+    others = {name: HASM(config, body) for name, config in without.items()}
+    for other in others.values():
+        taught(other, episodes)
+    both_ends = {"argmax": model.with_beta(float("inf")), "mean of all": model.with_beta(0.0)}
+    return both_ends | others
 
 
 def forgotten(model: HASM, episodes: list[Episode], body: Body) -> dict[str, Any]:
@@ -187,7 +203,7 @@ def main() -> None:
         "pushes": options.lessons * options.postures * options.pushes,
         "taught_s": sum(len(episode) for episode in episodes) / CONTROL_RATE,
         "learned_s": sum(seconds),
-        "tested": tested(env, model, options),
+        "tested": tested(env, {"memory": model} | controls(model, episodes, body), options),
         "forgotten": forgotten(model, episodes, body),
     }
     figures["grasp"], grasping = grasped(options.seed)
@@ -197,13 +213,14 @@ def main() -> None:
         print(filmed(model, grasping, options))
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(json.dumps(figures, indent=2) + "\n")
-    share, grasp = figures["tested"]["share_07_of_teacher"], figures["grasp"]
-    gone = figures["forgotten"]
+    shares = {name: found["share_07_of_teacher"] for name, found in figures["tested"].items()}
+    share, grasp, gone = shares.pop("memory"), figures["grasp"], figures["forgotten"]
     print(
         f"{figures['pushes']} pushes in {options.lessons} lessons, {figures['taught_s']:.0f} s of "
         f"teaching, learned in {figures['learned_s']:.2f} s\n"
         f"{options.tested} unseen pushes: {share:.0%} of the hand's own share go with the force "
-        f"(cos > {along_force.ALONG})\n"
+        f"(cos > {along_force.ALONG}); with parts replaced: "
+        f"{', '.join(f'{name} {other:.0%}' for name, other in shares.items())}\n"
         f"weight of the first lesson in its own posture: {gone['weight_before']:.2f}, after "
         f"forgetting it {gone['weight_after']:.2f}\n"
         f"a grasp shown once ({grasp['taught_s']:.0f} s) and repeated from {grasp['starts']} other "

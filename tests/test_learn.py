@@ -5,9 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from recordings import KINDS, write
 from toys import BASE, Recorded, along, make_body, postures, press, record, smooth_path, yielding
 
 from hasm_torch import HASM, Body, HASMConfig
+from hasm_torch.data import load_episodes
+from hasm_torch.data.body import body_of
 from hasm_torch.model.explain import KNOWN_COSINE, LEAST_WEIGHT
 
 BODY = make_body(3)
@@ -311,3 +314,30 @@ def test_a_base_without_limits_is_learned_too():
         model.learn(episode)
     moved = [body.joints[j] for j in model.settled.moved]
     assert set(moved) & set(BASE[:2])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_skins_of_every_kind_are_learned_forgotten_and_explained(kind, tmp_path):
+    """Three forces, one pressure, a wrench, no touch, and one more observation bound."""
+    data = load_episodes(write(kind, tmp_path / "data"))
+    body, episodes = body_of(data), data.episodes
+    model = HASM(HASMConfig(), body)
+    model.fit(episodes[:-1])
+    before, first = model.settled, model.origins
+    known = model.learn(episodes[-1])
+    assert known.number == len(episodes) - 1
+    assert model.settled.touch == before.touch
+    assert model.settled.beta == before.beta
+    last = episodes[-1]
+    for t in range(40):
+        seen = None if last.observations is None else torch.from_numpy(last.observations[t])
+        skin = None if last.tactile is None else torch.from_numpy(last.tactile[t])
+        model.step(torch.from_numpy(last.state[t]), skin, None, seen)
+    (why,) = model.explain()
+    assert sum(why.episodes.values()) == pytest.approx(1)
+    assert set(why.episodes) <= {known.number for known in model.episodes}
+    model.forget(known.number)
+    assert model.settled.code_facts == before.code_facts
+    np.testing.assert_array_equal(model.origins, first)
+    model.save_pretrained(tmp_path / "model")
+    assert HASM.from_pretrained(tmp_path / "model").episodes == model.episodes

@@ -56,7 +56,7 @@ def test_tables_of_all_pages_are_written(tmp_path, evaluated):
     figures = {"share_07_of_teacher": 0.9, "share_07_of_teacher_interval": [0.8, 0.95]}
     session = {
         "pushes": 96, "lessons": 8, "taught_s": 113.2, "learned_s": 0.87,
-        "tested": {"share_07_of_teacher": 0.8},
+        "tested": {"memory": along(0.8), "argmax": along(0.6)},
         "forgotten": {"weight_before": 0.7, "weight_after": 0.0},
         "grasp": {"lifted": 5, "starts": 5},
     }  # fmt: skip
@@ -89,6 +89,7 @@ def test_tables_of_all_pages_are_written(tmp_path, evaluated):
     assert "| lost 0.5 | 0.90, 0.40, 1.00 | 0.90, 0.80, 1.00 | 0.90, 0.30, 1.00 |" in method
     assert "| G1 | 0.5 s | 0.41 | none | 0.6 |" in method
     assert "| pushes shown | 96 | 8 |" in method
+    assert "| the same, argmax | 60% | 60% |" in method
     assert "| time of learning, all lessons | 0.87 s | 0.87 s |" in method
     again = readme_tables.write(tmp_path / "results", tmp_path)
     assert again == done

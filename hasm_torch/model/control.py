@@ -67,11 +67,13 @@ class Course:
         points: (N, J) positions of the moved joints on the way, rad or m.
         spikes: (N,) spikes from the first point to each.
         done: Spikes spent on the way so far.
+        asked: The recall that gave it.
     """
 
     points: Array
     spikes: Array
     done: float = 0.0
+    asked: Asked | None = None
 
     @property
     def finished(self) -> bool:

@@ -202,7 +202,9 @@ class HASM(nn.Module):
         ]
 
     def explain(self, rollout: Rollout | None = None) -> list[Explanation]:
-        """Why the last step moved the robot, one explanation a recall; none without a recall.
+        """Why the last step moved the robot, one explanation a recall.
+
+        A touch that goes on along a course is explained by the recall that gave the course.
 
         Args:
             rollout: The control loop; by default the model's own.
@@ -216,7 +218,14 @@ class HASM(nn.Module):
             return [] if moment is None else [explained_moment(recalling, moment, self.body.rate)]
         assert self.settled is not None
         parts = self.config, self.body, self.settled, recalling
-        return [explained(*parts, asked, self._made_of()) for asked in rollout.asked]
+        anew = {asked.touch.patch for asked in rollout.asked}
+        going_on = [
+            course.asked
+            for patch, course in rollout.courses.items()
+            if course.asked and patch not in anew and self.body.patches[patch] in rollout.touched
+        ]
+        asked = [*rollout.asked, *going_on]
+        return [explained(*parts, each, self._made_of()) for each in asked]
 
     def posture(self, row: int) -> Array:
         """(joints,) positions at which an association was made, rad or m."""

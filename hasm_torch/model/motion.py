@@ -158,6 +158,7 @@ class Motion:
                     if query is None:
                         break
                     course = recalling.course(query, touch, target, self._yaw(target))
+                    course.asked = rollout.asked[-1]
                     rollout.courses[touch.patch] = course
                 if walking and not self.config.distinct:
                     target[moved] = course.points[-1]
