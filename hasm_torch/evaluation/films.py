@@ -97,9 +97,9 @@ def _yield(env: Any, model: HASM, seed: int) -> Iterator[list[Frame]]:
         cells = [skin.slices[patch].stop - skin.slices[patch].start for patch in order]
         stops = [(str(patch), int(rng.integers(count))) for patch, count in zip(order, cells)]
         pushes = []
-        for number, i in enumerate((0, 3, 1, 4, 2)):  # wrist and torso, so that both move in turn
+        for turn, i in enumerate((0, 3, 1, 4, 2)):  # wrist and torso, so that both move in turn
             patch, cell = stops[i]
-            begin = number * (PUSH_SECONDS + GAP_SECONDS) + GAP_SECONDS
+            begin = turn * (PUSH_SECONDS + GAP_SECONDS) + GAP_SECONDS
             end = begin + PUSH_SECONDS
             pushes.append(Push({patch: (FORCE, cell)}, begin, end, rest=GAP_SECONDS))
         camera = _Camera(env)
