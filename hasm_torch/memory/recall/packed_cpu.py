@@ -10,7 +10,9 @@ from hasm_torch.memory.recall import packed_kernel as kernel
 from hasm_torch.memory.recall.interaction import Interaction
 from hasm_torch.memory.recall.packed_weigh import EXPONENTIAL, KINDS
 
-_HELD = 1 << 24  # rows within reach and counts held at once, at most 128 MiB
+# Rows within reach that are held at once: 2 MiB, about the second-level cache of two threads; but
+# for fewer queries than this a large memory would be read anew too often.
+_HELD, _QUERIES = 1 << 18, 16
 # Threads are worth starting to compare at least so many 32-bit words, about 0.5 ms of one thread.
 _TEAM_WORDS = 1 << 22
 
@@ -54,17 +56,24 @@ def scan_cpu(
     addresses = tuple([0 if tensor is None else tensor.data_ptr() for tensor in tensors])
     kind = KINDS[interaction] if isinstance(interaction, str) else EXPONENTIAL - interaction
     options = beta, kind, top_k or 0
-    step = max(1, _HELD // (blocks * kernel.ROWS + dim))
-    for first in range(0, queries, step):
-        end = min(first + step, queries)
-        compared = (end - first) * width * blocks * kernel.ROWS
-        threads = torch.get_num_threads() if compared >= _TEAM_WORDS else 1
-        for memory in range(memories):
-            arguments = sizes, addresses, options, (memory, first, end)
-            if threads == 1:
-                kernel.recall(*arguments)
-            else:
-                _recall_by_team(threads, *arguments)
+    step = max(_QUERIES, _HELD // (blocks * kernel.ROWS + dim))
+    shares = [
+        (memory, first, min(first + step, queries))
+        for memory in range(memories)
+        for first in range(0, queries, step)
+    ]
+    threads = torch.get_num_threads()
+    if memories * queries * width * blocks * kernel.ROWS < _TEAM_WORDS:
+        threads = 1
+    if 1 < threads <= len(shares):
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(lambda share: kernel.recall(sizes, addresses, options, share), shares))
+        return
+    for share in shares:
+        if threads == 1:
+            kernel.recall(sizes, addresses, options, share)
+        else:
+            _recall_by_team(threads, sizes, addresses, options, share)
 
 
 def _recall_by_team(threads: int, *arguments: Any) -> None:

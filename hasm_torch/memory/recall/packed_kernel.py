@@ -19,6 +19,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from llvmlite import ir
 from numba import carray, njit, types
 from numba.extending import intrinsic
 
@@ -74,6 +75,36 @@ def _count_ones(typing_context, bits):
         return builder.ctpop(arguments[0])
 
     return types.uint32(types.uint32), emit
+
+
+@intrinsic
+def _lowest(typing_context, bits):
+    """Number of the lowest one in a uint64 other than zero."""
+
+    def emit(context, builder, signature, arguments):
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.uint64(types.uint64), emit
+
+
+@intrinsic
+def _at_most(typing_context, distances, reach):
+    """Which of 64 int32 are at most ``reach``: a bit each, the first one lowest.
+
+    The compiler does not arrive at a comparison of vectors whose outcome is a number by itself.
+    """
+    lane = ir.IntType(32)
+    lanes = ir.VectorType(lane, ROWS)
+
+    def emit(context, builder, signature, arguments):
+        array = context.make_array(signature.args[0])(context, builder, arguments[0])
+        values = builder.load(builder.bitcast(array.data, lanes.as_pointer()), align=4)
+        empty = ir.Constant(lanes, ir.Undefined)
+        one = builder.insert_element(empty, builder.trunc(arguments[1], lane), lane(0))
+        limits = builder.shuffle_vector(one, empty, ir.Constant(lanes, [0] * ROWS))
+        return builder.bitcast(builder.icmp_signed("<=", values, limits), ir.IntType(64))
+
+    return types.uint64(distances, types.int64), emit
 
 
 @njit(nogil=True, cache=True)
@@ -160,72 +191,50 @@ def compare(job, part):
     for first in range(begin, end, group):
         for query in range(queries):
             signs, found = job.signs[query], job.found[part, query]
+            least, second, match = found
             near, counts = job.near[query, begin * ROWS :], job.counts[part, query]
             number = job.number[part, query]
             for block in range(first, min(first + group, end)):
-                reach = min(found[0] + job.slack, dim)
+                reach = min(least + job.slack, dim)
                 if certain:
-                    reach = min(max(reach, found[1] - 1), dim)
-                least = _distances(words[block], signs, reach, distances)
-                if least <= reach and (masked or (block + 1) * ROWS > job.count):
-                    least = _leave_out(job.mask, job.count, query, block, distances)
-                if least > reach:
-                    continue
-                for row in range(ROWS):
-                    if distances[row] <= reach:
-                        counts[distances[row]] += 1
-                        near[number, 0], near[number, 1] = block * ROWS + row, distances[row]
-                        number += 1
-                if least < found[1]:
-                    _note(found, distances, block * ROWS)
+                    reach = min(max(reach, second - 1), dim)
+                rows = _within_reach(words[block], signs, reach, distances)
+                while rows != 0:
+                    place = np.int64(_lowest(rows))  # type: ignore[call-arg]
+                    rows &= rows - np.uint64(1)
+                    row, distance = block * ROWS + place, distances[place]
+                    if row >= job.count or (masked and not job.mask[query, row]):
+                        continue
+                    counts[distance] += 1
+                    near[number, 0], near[number, 1] = row, distance
+                    number += 1
+                    if distance < second:
+                        second = max(distance, least)
+                        if distance < least:
+                            least, match = distance, row
+            found[:] = least, second, match
             job.number[part, query] = number
 
 
 @njit(nogil=True, cache=True)
-def _distances(words, signs, reach, distances):
-    """Distances of a query to the rows of a block, (64,); returns the least, FAR once out of reach.
+def _within_reach(words, signs, reach, distances):
+    """Distances of a query to the rows of a block, (64,); returns which are in reach, a bit each.
 
     A distance only grows from word to word, so a block is left when all its rows are out of reach.
     """
     distances[:] = 0
     width = len(signs)
     step = _PART if reach < 32 * (width - 1) else width
+    rows = np.uint64(0)
     for first in range(0, width, step):
-        if first > 0 and _least(distances) > reach:
-            return FAR
         for word in range(first, min(first + step, width)):
             bits = signs[word]
             for row in range(ROWS):
                 distances[row] += _count_ones(words[word, row] ^ bits)  # type: ignore[call-arg]
-    return _least(distances)
-
-
-@njit(nogil=True, cache=True)
-def _least(distances):
-    least = distances[0]
-    for row in range(1, ROWS):
-        least = min(least, distances[row])
-    return least
-
-
-@njit(nogil=True, cache=True)
-def _leave_out(mask, count, query, block, distances):
-    """Puts rows that take no part out of reach; returns the least distance left."""
-    for row in range(ROWS):
-        place = block * ROWS + row
-        if place >= count or (len(mask) > 0 and not mask[query, place]):
-            distances[row] = FAR
-    return _least(distances)
-
-
-@njit(nogil=True, cache=True)
-def _note(found, distances, first_row):
-    """Notes the least distance, the second least and the row of the least."""
-    for row in range(ROWS):
-        if distances[row] < found[0]:
-            found[1], found[0], found[2] = found[0], distances[row], first_row + row
-        elif distances[row] < found[1]:
-            found[1] = distances[row]
+        rows = _at_most(distances, reach)  # type: ignore[call-arg]
+        if rows == 0:
+            break
+    return rows
 
 
 @njit(nogil=True, cache=True)
