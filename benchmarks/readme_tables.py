@@ -13,6 +13,9 @@ is made of lies in benchmarks/results/:
     uv run benchmarks/yield_controls.py                    # → yield_controls.json
     uv run benchmarks/rules.py                             # → rules.json
     uv run benchmarks/skin_filter.py                       # → skin_filter.json
+    uv run examples/skin_on_another_robot.py               # → another_robot.json
+    uv run benchmarks/recall.py --quick=true               # recall.json → recall.json
+    uv run benchmarks/izhikevich.py                        # izhikevich.json → izhikevich.json
     uv run benchmarks/readme_tables.py
 """
 
@@ -36,6 +39,13 @@ from hasm_torch.evaluation.report import (
 MARKED = re.compile(r"(<!-- table:(\w+) -->\n)(.*?)(<!-- /table:\2 -->)", re.DOTALL)
 OPEN_LOOP = {"hasm": "memory", "neighbours": "tuned neighbours", "ridge": "ridge on lags"}
 ROBOTS = {"open_loop_icub": "iCub", "open_loop_g1": "G1"}
+
+RECALLS = {
+    "hasm_torch packed": "packed",
+    "torch float32": "torch float32",
+    "torch bfloat16": "torch bfloat16",
+    "torch SDPA": "SDPA",
+}
 
 Rows = Sequence[Sequence[str]]
 
@@ -181,6 +191,56 @@ def skin_filter(measured: dict[str, Any]) -> str:
     return markdown(("fault", "no filter", "filter", "filter without its rule"), rows)
 
 
+def another_robot(measured: dict[str, Any]) -> str:
+    """Yielding of a robot that the code was not written for."""
+    rows = [
+        [name, f"{found['share_07_of_teacher']:.2f}", f"{found['travel_of_teacher'] + 0:.2f}"]
+        for name, found in measured["tested"].items()
+    ]
+    return markdown(("", "`share_07_of_teacher`", "`travel_of_teacher`"), rows)
+
+
+def recall(measured: dict[str, Any]) -> str:
+    """Times of a recall, a row a size, a column a contestant."""
+    times: dict[tuple[int, int, int], dict[str, float]] = {}
+    for found in measured["results"]:
+        size = found["rows"], found["dim"], found["batch"]
+        times.setdefault(size, {})[found["contestant"]] = found["seconds"]
+    rows = [
+        [
+            f"{count:,} x {dim}, {batch:,}",
+            *(f"{_shown(1e3 * mine[who])} ms" if who in mine else "" for who in RECALLS),
+        ]
+        for (count, dim, batch), mine in times.items()
+    ]
+    return markdown(("associations x entries, queries", *RECALLS.values()), rows)
+
+
+def izhikevich(measured: dict[str, Any]) -> str:
+    """Times of the neurons beside another library's."""
+    rows = [
+        [
+            f"{name}, {found['neurons']:,} x {found['steps']:,}",
+            *(f"{_shown(1e3 * found['median_s'][who])} ms" for who in ("ours", "norse")),
+            _shown(found["ratio"]),
+        ]
+        for name, found in measured["work"].items()
+    ]
+    return markdown(("neurons x steps", "hasm_torch", "norse", "ratio"), rows)
+
+
+def resources(evaluated: dict[str, Any]) -> str:
+    """What learning, the memory and a control step take."""
+    tick = evaluated["tick_ms"]
+    rows = [
+        ["learning, s", "≤ 5", _shown(evaluated["train_seconds"])],
+        ["memory, bytes", "≤ 1,000,000", _shown(evaluated["memory_bytes"])],
+        ["control step, median, ms", "≤ 0.35", _shown(tick["median"])],
+        ["control step, 99 of 100, ms", "", _shown(tick["p99"])],
+    ]
+    return markdown(("", "should be", "measured"), rows)
+
+
 # What each table is made of, in the order of its arguments.
 TABLES: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     "default": (default, ("eval_default",)),
@@ -190,6 +250,10 @@ TABLES: dict[str, tuple[Callable[..., str], tuple[str, ...]]] = {
     "controls": (controls, ("yield_controls",)),
     "rules": (rules, ("rules",)),
     "skin_filter": (skin_filter, ("skin_filter",)),
+    "another_robot": (another_robot, ("another_robot",)),
+    "recall": (recall, ("recall",)),
+    "izhikevich": (izhikevich, ("izhikevich",)),
+    "resources": (resources, ("eval_default",)),
     "teach": (teach, ("teach_in_two_minutes", "teach_single_pushes")),
 }
 
@@ -240,7 +304,9 @@ def _interval(figures: dict[str, Any]) -> str:
 def _shown(value: float | None) -> str:
     if value is None:
         return "none"
-    return f"{value:,}" if isinstance(value, int) else f"{value:.3g}"
+    if isinstance(value, int) or abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:.3g}"
 
 
 def main() -> None:

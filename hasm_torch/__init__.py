@@ -1,5 +1,7 @@
 """Hetero-associative sequential memory for touch-driven robots, as PyTorch modules."""
 
+from importlib.metadata import PackageNotFoundError, version
+
 from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig
 from hasm_torch.encoders.bipolar import binarise, bind, to_bipolar
@@ -10,6 +12,11 @@ from hasm_torch.encoders.touch import EffectiveForce, TactileEmbedding
 from hasm_torch.memory import functional
 from hasm_torch.memory.layer import HeteroAssociativeMemory
 from hasm_torch.model.hasm import HASM
+
+try:
+    __version__ = version("hasm-torch")
+except PackageNotFoundError:  # run from a folder without being installed
+    __version__ = "0+unknown"
 
 __all__ = [
     "HASM",
@@ -22,6 +29,7 @@ __all__ = [
     "PlaceCode",
     "RoPE3D",
     "TactileEmbedding",
+    "__version__",
     "binarise",
     "bind",
     "functional",

@@ -28,6 +28,8 @@ class Body:
             alike.
         base: Names of the joints x, y and yaw of a mobile base, or none.
         observations: Number of entries of each further observation that is bound, by its name.
+        targets: Names of the joints in the order in which a robot takes its targets, where that
+            is another than that of its state.
         rate: Control and sampling rate, Hz.
         channels: Readings of a cell in the tactile vector: 3 forces, 1 pressure, or a wrench of 6,
             whose sensor then counts as six cells, one a direction (see ``readings``); 0 is a robot
@@ -49,6 +51,7 @@ class Body:
     groups: list[int] = field(default_factory=list)
     base: list[str] = field(default_factory=list)
     observations: dict[str, int] = field(default_factory=dict)
+    targets: list[str] = field(default_factory=list)
     rate: float = 50.0
     channels: int = 3
     unit: str = "N"
@@ -88,5 +91,10 @@ class Body:
                 raise ValueError(f"{name}: expected lower < upper limit, got {low} and {high}")
             if not speed > 0:
                 raise ValueError(f"{name}: expected a speed limit above 0, got {speed}")
+        if self.targets and sorted(self.targets) != sorted(self.joints):
+            raise ValueError(
+                f"targets must be the joints in some order, {', '.join(self.joints)}, got "
+                f"{', '.join(self.targets)}"
+            )
         if unknown := [name for name in self.base if name not in self.joints]:
             raise ValueError(f"the base names unknown joints: {', '.join(unknown)}")

@@ -5,9 +5,9 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-BELOW = ("_assets", "_headless", "body", "config", "episode")  # modules that all may use
+BELOW = ("_assets", "_extras", "_headless", "body", "config", "episode")  # modules that all may use
 FLOORS = ("kernels", "encoders", "memory", "model", "robot", "sim", "data", "evaluation", "touch",
-          "lerobot", "apps", "__init__")  # fmt: skip
+          "ros", "lerobot", "apps", "__init__")  # fmt: skip
 MODULES = {
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted((ROOT / "hasm_torch").rglob("*.py"))

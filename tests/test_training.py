@@ -120,7 +120,7 @@ def test_features_by_option(roots):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_episodes_of_every_kind_can_be_watched(roots, tmp_path, monkeypatch, capsys, kind):
-    scenes = dataset_scenes(roots[kind])
+    scenes = dataset_scenes([roots[kind]])
     frames = sum(len(episode) for episode in episodes(kind))
     assert scenes.state.shape == (frames, len(JOINTS))
     if kind == "none":

@@ -1,1 +1,5 @@
 """Command lines."""
+
+from hasm_torch._extras import require
+
+require("robot")

@@ -4,6 +4,7 @@ uv run python -m hasm_torch.apps.rerun_recording --dataset.root=data/mine --outp
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,26 +13,26 @@ import numpy as np
 from hasm_torch.apps.command_line import parse_options
 from hasm_torch.config import HASMConfig
 from hasm_torch.data.body import body_of
-from hasm_torch.data.episodes import FeatureMap, load_episodes
+from hasm_torch.data.episodes import FeatureMap, load_all
 from hasm_torch.data.training import DatasetConfig, RobotConfig
 from hasm_torch.evaluation.viewer import Scenes, cell_places, write_recording
 from hasm_torch.model.felt import calibrate, recorded_forces, skin_encoder
 
 
 def dataset_scenes(
-    root: Path, features: FeatureMap | None = None, urdf: Path | None = None
+    roots: Sequence[Path], features: FeatureMap | None = None, urdf: Path | None = None
 ) -> Scenes:
     """All episodes of a dataset, one after the other.
 
     Args:
-        root: Folder of the dataset.
+        roots: Folders of datasets of one robot.
         features: Which features are read; LeRobot's usual names by default.
         urdf: The robot's URDF, see ``body_of``.
 
     Raises:
         FileNotFoundError, ValueError: See ``load_episodes`` and ``body_of``.
     """
-    data = load_episodes(root, features)
+    data = load_all(roots, features)
     state = np.concatenate([episode.state for episode in data])
     scenes = Scenes(np.arange(len(state)) / data.fps, list(data.joints), state)
     if data.skin:
@@ -67,7 +68,7 @@ def main() -> None:
     if config.dataset.root is None:
         sys.exit("a dataset is needed, for example --dataset.root=datasets/hsr_grasp")
     try:
-        scenes = dataset_scenes(config.dataset.root, config.features, config.robot.urdf)
+        scenes = dataset_scenes(config.dataset.roots, config.features, config.robot.urdf)
         write_recording(config.output, scenes, "episodes")
     except (OSError, ValueError) as error:
         sys.exit(str(error))

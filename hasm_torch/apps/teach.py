@@ -99,6 +99,19 @@ class TeachConfig:
     teach_seed: int = 0
 
 
+def record_if_missing(root: Path, names: Collection[str]) -> None:
+    """Record bundled datasets where a checkout has them and an installed package does not.
+
+    Args:
+        root: Folder that holds the datasets; another than the default one is left alone.
+        names: Which datasets are needed.
+    """
+    missing = [name for name in names if not (root / name).exists()]
+    if missing and root == TeachConfig().root:
+        print(f"recording the teaching, once, in simulation: {', '.join(missing)} in {root}")
+        teach(root, TeachConfig().teach_seed, missing)
+
+
 def main() -> None:
     """Record all datasets, replacing those that are there."""
     config = draccus.parse(config_class=TeachConfig)

@@ -8,13 +8,14 @@ from typing import Literal
 import torch
 
 from hasm_torch.apps.command_line import parse_options
+from hasm_torch.apps.teach import record_if_missing
 from hasm_torch.config import HASMConfig
 from hasm_torch.model.hasm import HASM
 from hasm_torch.sim.scene import SCENES
 from hasm_torch.touch.link import PageProcess
 from hasm_torch.touch.session import Session
 from hasm_torch.touch.shelf import Shelf
-from hasm_torch.touch.simulated import body_in, check_body
+from hasm_torch.touch.simulated import BUNDLED, body_in, check_body
 
 # How long a thread keeps Python to itself, s: physics and recall give it away many times a control
 # step, and what learns beside them would hand it back after 5 ms each time.
@@ -68,6 +69,7 @@ def open_session(config: TouchConfig) -> Session:
         check_body(model.body, config.scene)
     session = Session(config.scene, model, Shelf(config.output_dir), config.seed)
     if config.checkpoint is None and config.teach == "bundled":
+        record_if_missing(config.datasets, [BUNDLED[config.scene]])
         session.load_bundled(config.datasets)
     return session
 

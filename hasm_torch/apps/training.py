@@ -41,7 +41,7 @@ def main() -> None:
         )
     try:
         method = settings(config.method, config.model)
-        trained = train(config.dataset.root, method, config.features, config.robot.urdf)
+        trained = train(config.dataset.roots, method, config.features, config.robot.urdf)
         trained.model.save_pretrained(config.output_dir)
     except (OSError, ValueError) as error:
         sys.exit(f"train.py: {error}")

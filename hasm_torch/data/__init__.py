@@ -4,15 +4,19 @@ Inside this package ``import lerobot`` is the installed LeRobot library. Reading
 only; LeRobot itself is imported where a dataset is written.
 """
 
-from hasm_torch.data.card import write_card
-from hasm_torch.data.episodes import (
+from hasm_torch._extras import require
+
+require("robot")
+
+from hasm_torch.data.card import write_card  # noqa: E402
+from hasm_torch.data.episodes import (  # noqa: E402
     Episode,
     EpisodeSet,
     FeatureMap,
     load_episodes,
 )
-from hasm_torch.data.recording import write_episodes
-from hasm_torch.data.skin import SkinPatch, skin_patches
+from hasm_torch.data.recording import write_episodes  # noqa: E402
+from hasm_torch.data.skin import SkinPatch, skin_patches  # noqa: E402
 
 __all__ = [
     "Episode",

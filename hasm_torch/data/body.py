@@ -69,6 +69,7 @@ def body_of(data: EpisodeSet, urdf: Path | None = None) -> Body:
         links=[patch.link or "" for patch in patches] or [""],
         groups=[parts.index(part) for part in parts] or [0],
         observations=dict(data.observations),
+        targets=list(data.action_names) if data.reordered else [],
         rate=float(data.fps),
         channels=patches[0].channels if patches else 0,
         unit=patches[0].unit if patches else "N",
@@ -114,6 +115,8 @@ def describe_body(data: EpisodeSet, body: Body, urdf: Path | None = None) -> lis
     if body.observations:
         bound = (f"{name} ({entries})" for name, entries in body.observations.items())
         lines.append(f"bound besides: {', '.join(bound)}")
+    if data.unused:
+        lines.append(f"not used, since the memory takes no pictures: {', '.join(data.unused)}")
     return lines
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import chain, islice
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,14 @@ from hasm_torch.data.skin import (
     UNKNOWN_UNIT,
     SkinPatch,
     feature_names,
+    held,
+    same_skin,
     skin_from_info,
     tactile_layout,
 )
 from hasm_torch.episode import ACTION, STATE, TACTILE, Episode
+
+PICTURES = ("image", "video")
 
 
 @dataclass(eq=False)
@@ -38,7 +42,9 @@ class EpisodeSet:
         units: Units of the state's entries (``rad``, ``m``, ``deg``; ``unknown`` if not stated).
         skin: Patches by name, or None without skin.
         root: Folder of the dataset.
-        action_names: Names of the action's entries.
+        action_names: Names of the action's entries as the dataset has them; where they are the
+            joints in another order, the episodes have them in the order of the joints.
+        unused: Names of pictures and videos that the dataset has besides.
         observations: Number of entries of each further observation that is bound, by feature.
     """
 
@@ -50,6 +56,15 @@ class EpisodeSet:
     root: Path
     action_names: tuple[str, ...]
     observations: dict[str, int] = field(default_factory=dict)
+    unused: tuple[str, ...] = ()
+
+    @property
+    def reordered(self) -> list[int]:
+        """Entry of the action that is each joint's target; empty where the order is the same."""
+        same = self.action_names == self.joints
+        if same or sorted(self.action_names) != sorted(self.joints):
+            return []
+        return [self.action_names.index(joint) for joint in self.joints]
 
     def __len__(self) -> int:
         return len(self.episodes)
@@ -93,7 +108,8 @@ def load_episodes(
             at every iteration, one at a time, and checked when they are reached.
 
     Returns:
-        Every episode of the dataset.
+        Every episode of the dataset. Cells that did not report hold their last reading, where the
+        dataset declares their NaN by ``"missing": "nan"`` in the tactile feature's ``info``.
 
     Raises:
         FileNotFoundError: There is no dataset, or a file of it is missing.
@@ -129,6 +145,7 @@ def load_episodes(
         root=root,
         action_names=_entry_names(declared[names.action], names.action),
         observations={key: prod(shapes[key]) for key in bound},
+        unused=tuple(key for key in declared if declared[key].get("dtype") in PICTURES),
     )
     stored = _Stored(
         data=data,
@@ -138,11 +155,61 @@ def load_episodes(
         indices=rows["episode_index"].tolist(),
         spans=spans,
         layout=layout,
+        gaps=bool(tactile and (declared[tactile].get("info") or {}).get("missing") == "nan"),
         tasks=np.array(parquet.read_tasks(root), dtype=object),
         tolerance_s=tolerance_s,
     )
     data.episodes = stored if stored.nbytes > most_bytes else list(stored)
     return data
+
+
+def load_all(
+    roots: Sequence[Path], features: FeatureMap | None = None, most_bytes: float = math.inf
+) -> EpisodeSet:
+    """The episodes of several datasets of one robot, one dataset after the other.
+
+    Args:
+        roots: Their folders, at least one.
+        features: See ``load_episodes``.
+        most_bytes: See ``load_episodes``, for each dataset.
+
+    Raises:
+        FileNotFoundError, ValueError: See ``load_episodes``.
+        ValueError: If two differ in joints, skin, frame rate or what is bound.
+    """
+    sets = [load_episodes(root, features, most_bytes=most_bytes) for root in roots]
+    first = sets[0]
+    for other in sets[1:]:
+        for what in ("fps", "joints", "units", "action_names", "observations"):
+            mine, theirs = getattr(first, what), getattr(other, what)
+            if mine != theirs:
+                raise ValueError(
+                    f"datasets that are learned together must have the same {what}: {first.root} "
+                    f"has {mine}, {other.root} has {theirs}"
+                )
+        if not same_skin(first.skin, other.skin):
+            raise ValueError(
+                f"datasets that are learned together must have the same skin: that of {first.root} "
+                f"and {other.root} differ"
+            )
+    return first if len(sets) == 1 else replace(first, episodes=_Chained(sets))
+
+
+@dataclass(eq=False)
+class _Chained(Sequence[Episode]):
+    """The episodes of several datasets, numbered on."""
+
+    sets: list[EpisodeSet]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.sets))
+
+    def __getitem__(self, index: Any) -> Any:
+        return next(islice(self, index, None))
+
+    def __iter__(self) -> Iterator[Episode]:
+        for number, episode in enumerate(chain.from_iterable(self.sets)):
+            yield replace(episode, index=number)
 
 
 @dataclass(eq=False)
@@ -156,6 +223,7 @@ class _Stored(Sequence[Episode]):
     indices: list[int]
     spans: list[tuple[int, int]]
     layout: tuple[int, int] | None
+    gaps: bool
     tasks: np.ndarray
     tolerance_s: float
 
@@ -207,14 +275,19 @@ class _Stored(Sequence[Episode]):
             if key is not None:
                 # a copy: what Arrow gives is read-only
                 values[key] = columns[key].astype(np.float32).reshape(length, -1)
+                if key == names.tactile and self.gaps:
+                    values[key] = held(values[key])
                 check_finite(values[key], key, index)
+        action: np.ndarray = values[names.action]
+        if self.data.reordered:
+            action = action[:, self.data.reordered]
         return Episode(
             index=index,
             # an episode with several tasks names them in the order in which they come up
             task="; ".join(dict.fromkeys(self.tasks[columns["task_index"]])),
             time=columns["timestamp"].copy(),
             state=values[names.state],
-            action=values[names.action],
+            action=action,
             tactile=values[names.tactile].reshape(-1, *self.layout)
             if names.tactile and self.layout
             else None,
@@ -228,7 +301,7 @@ def _shape(declared: Mapping[str, Any], key: str, root: Path) -> tuple[int, ...]
             f"Expected a feature {key!r} in {root}, found {sorted(declared)}. "
             "Name the feature to read with FeatureMap."
         )
-    if declared[key].get("dtype") in ("image", "video", "string"):
+    if declared[key].get("dtype") in (*PICTURES, "string"):
         raise ValueError(f"Expected numbers in feature {key!r}, got {declared[key]['dtype']}.")
     shape = tuple(declared[key]["shape"])
     return () if shape == (1,) else shape  # LeRobot stores one entry as a plain number

@@ -206,6 +206,18 @@ def tactile_layout(feature: Mapping[str, Any], key: str) -> tuple[int, int]:
     return prod(shape) // channels, channels
 
 
+def held(readings: np.ndarray) -> np.ndarray:
+    """Readings (T, entries) where NaN, of a cell that did not report, is its last one, at first 0.
+
+    Args:
+        readings: As recorded.
+    """
+    rows = np.arange(len(readings))[:, None]
+    known = np.maximum.accumulate(np.where(np.isnan(readings), -1, rows), axis=0)
+    filled = np.take_along_axis(readings, known.clip(min=0), axis=0)
+    return np.where(known < 0, np.float32(0.0), filled)
+
+
 def feature_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     """Names of a feature's entries; empty where the dataset names none.
 
@@ -218,3 +230,14 @@ def feature_names(feature: Mapping[str, Any]) -> tuple[str, ...]:
             return ()
         names = nested[0]
     return tuple(str(name) for name in names or ())
+
+
+def same_skin(
+    first: Mapping[str, SkinPatch] | None, second: Mapping[str, SkinPatch] | None
+) -> bool:
+    """Whether two datasets describe the same skin."""
+    described = [
+        skin and skin_to_info(skin, max(p.cells.stop for p in patches), patches[0].channels)
+        for skin, patches in ((skin, list((skin or {}).values())) for skin in (first, second))
+    ]
+    return described[0] == described[1]

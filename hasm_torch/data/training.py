@@ -1,6 +1,7 @@
 """From a dataset to a trained model."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,7 @@ import numpy as np
 from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig
 from hasm_torch.data.body import body_of, describe_body
-from hasm_torch.data.episodes import FeatureMap, load_episodes
+from hasm_torch.data.episodes import FeatureMap, load_all
 from hasm_torch.episode import Episode
 from hasm_torch.model.fit import FitReport
 from hasm_torch.model.hasm import HASM
@@ -25,9 +26,16 @@ class DatasetConfig:
 
     Attributes:
         root: Folder of the LeRobot v3.0 dataset.
+        more: Folders of further datasets of the same robot, learned together with it.
     """
 
     root: Path | None = None
+    more: list[Path] = field(default_factory=list)
+
+    @property
+    def roots(self) -> list[Path]:
+        """All folders."""
+        return [] if self.root is None else [self.root, *self.more]
 
 
 @dataclass
@@ -82,7 +90,7 @@ def settings(method: Method, model: HASMConfig) -> HASMConfig:
 
 
 def train(
-    root: Path,
+    roots: Path | Sequence[Path],
     config: HASMConfig,
     features: FeatureMap | None = None,
     urdf: Path | None = None,
@@ -90,7 +98,7 @@ def train(
     """Learn a dataset; one that is large for the memory is read an episode at a time.
 
     Args:
-        root: Folder of the dataset.
+        roots: Folder of the dataset, or of several.
         config: Settings of the method.
         features: Which features are read; LeRobot's usual names by default.
         urdf: The robot's URDF, see ``body_of``.
@@ -105,12 +113,13 @@ def train(
     warm_up()
     begin = time.perf_counter()
     names = features or FeatureMap()
-    data = load_episodes(root, names, most_bytes=MOST_BYTES)
+    folders = [roots] if isinstance(roots, Path) else list(roots)
+    data = load_all(folders, names, most_bytes=MOST_BYTES)
     body = body_of(data, urdf)
     if len(data.action_names) != len(body.joints):
         raise ValueError(
-            f"the action of {root} has {len(data.action_names)} entries, expected a target for "
-            f"each of the {len(body.joints)} joints; with --features.action={names.state} "
+            f"the action of {data.root} has {len(data.action_names)} entries, expected a target "
+            f"for each of the {len(body.joints)} joints; with --features.action={names.state} "
             "the measured positions are learned instead"
         )
     model = HASM(config, body)

@@ -24,7 +24,7 @@ from tqdm import tqdm
 from hasm_torch.body import Body
 from hasm_torch.config import write_json
 from hasm_torch.data.body import body_of, describe_body
-from hasm_torch.data.episodes import EpisodeSet, load_episodes
+from hasm_torch.data.episodes import EpisodeSet, load_all
 from hasm_torch.data.training import settings
 from hasm_torch.episode import Episode
 from hasm_torch.evaluation.opponents import tuned
@@ -80,7 +80,7 @@ def open_loop(config: EvalConfig) -> dict[str, Any]:
     if not config.horizon_s > 0:
         raise ValueError(f"horizon_s must be above 0 s, got {config.horizon_s}")
     begin = time.perf_counter()
-    data = load_episodes(config.dataset.root, config.features)
+    data = load_all(config.dataset.roots, config.features)
     whole = body_of(data, config.robot.urdf)
     for line in describe_body(data, whole, config.robot.urdf):
         print(line)

@@ -3,16 +3,20 @@
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+from hasm_torch._extras import require
+
+require("viz")
+
+import matplotlib  # noqa: E402
 
 matplotlib.use("Agg")
 
-import matplotlib.pyplot as plt
-import numpy as np
-from numpy.typing import NDArray
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
 
-from hasm_torch.evaluation.rollout import Trace
-from hasm_torch.robot import JOINTS
+from hasm_torch.evaluation.rollout import Trace  # noqa: E402
+from hasm_torch.robot import JOINTS  # noqa: E402
 
 Array = NDArray[np.float64]
 

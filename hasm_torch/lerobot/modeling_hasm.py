@@ -101,7 +101,7 @@ class HASMPolicy(PreTrainedPolicy):
             **kwargs: What LeRobot also offers to policies; unused.
 
         Returns:
-            (B, joints) joint targets, rad or m.
+            (B, joints) joint targets, rad or m, in the order of the action.
 
         Raises:
             ValueError: If a shape is off, or B changes without a ``reset``.
@@ -119,7 +119,9 @@ class HASMPolicy(PreTrainedPolicy):
                 f"{len(states)}; call reset() first"
             )
         steps = zip(states, skins, self._rollouts, seen, strict=True)
-        return torch.stack([self.model.step(*step) for step in steps])
+        targets = torch.stack([self.model.step(*step) for step in steps])
+        order = [body.joints.index(name) for name in body.targets]
+        return targets[:, order] if order else targets
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """``select_action`` as a chunk of one, (B, 1, joints): touch decides the next one."""

@@ -16,6 +16,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from hasm_torch._extras import require
 from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig, as_dict, write_json
 from hasm_torch.episode import ACTION, STATE, TACTILE
@@ -58,6 +59,7 @@ def save(settings: Settings, tensors: dict[str, Tensor], directory: Path) -> Non
 
 def save_weights(tensors: dict[str, Tensor], directory: Path) -> None:
     """Write ``model.safetensors``, whole or not at all; arguments as in ``save``."""
+    require("robot")
     from safetensors.torch import save_file
 
     directory.mkdir(parents=True, exist_ok=True)
@@ -95,6 +97,7 @@ def load_weights(model: nn.Module, directory: Path) -> None:
     Raises:
         ValueError: If the file is damaged, does not fit the settings, or the memory is not full.
     """
+    require("robot")
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -139,8 +142,10 @@ def processors(observations: dict[str, Any], actions: dict[str, Any]) -> dict[st
     def step(name: str, **config: Any) -> dict[str, Any]:
         return {"registry_name": name, "config": config}
 
+    sizes = {name: feature["shape"][0] for name, feature in observations.items()}
     return {
         "policy_preprocessor": [
+            step("hasm_split_state", sizes=sizes),
             step("rename_observations_processor", rename_map={}),
             step("to_batch_processor"),
             step("device_processor", device="cpu", float_dtype=None),

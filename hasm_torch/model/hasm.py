@@ -23,6 +23,7 @@ from hasm_torch.body import Body
 from hasm_torch.config import HASMConfig
 from hasm_torch.encoders.readings import forces_of
 from hasm_torch.encoders.skin import SkinEncoder
+from hasm_torch.memory.recall import warm_up
 from hasm_torch.model import checkpoint, predict
 from hasm_torch.model.choose import ARGMAX_BETA
 from hasm_torch.model.control import Array, Rollout, limit_speed
@@ -101,6 +102,7 @@ class HASM(nn.Module):
             raise ValueError(
                 f"unknown patches {', '.join(unknown)}, valid: {', '.join(self.body.patches)}"
             )
+        warm_up()  # so that neither a control step waits nor its rounding depends on the clock
         device = self.tolerance.device
         scale = settled.threshold, settled.current_per_newton
         self.skin = skin_encoder(self.config, self.body, *scale).to(device)

@@ -1,7 +1,9 @@
 """The Toyota HSR: its joints and links (``Kinematics``) and the skin on them (``Skin``)."""
 
+from hasm_torch._extras import require
 from hasm_torch._headless import prefer_egl
 
+require("robot")
 prefer_egl()
 
 from hasm_torch.robot.kinematics import BASE_FRAME, JOINTS, METRES, Kinematics  # noqa: E402

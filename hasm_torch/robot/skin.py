@@ -1,7 +1,9 @@
-"""The HSR's skin: where its cells lie, which way they face, and how they move with the robot."""
+"""A robot's skin: where its cells lie, which way they face, and how they move with the robot."""
 
 import json
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +22,13 @@ PATCHES = (
     "hand",
 )
 """Patches of the HSR's skin; the cells of all patches follow each other in this order."""
+
+ABOUT = (
+    "Skin cells of a robot. Lengths in m, in the frame of each patch's link. 'points' are the three"
+    " normal-force sensors of a cell. 'surface', of a flat patch, is the thin box it is made of:"
+    " its axes are unit vectors (rows: along a row of cells, across the rows, outward), half_size"
+    " runs along them, and the cells lie on its outer face."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +54,7 @@ class Skin:
         patches: names of the patches, in order.
         slices: patch name to the range of its cells.
         link: patch name to the link that carries it.
-        surfaces: patch name to its box; the cells lie on the box's outer face.
+        surfaces: flat patch's name to its box; the cells lie on the box's outer face.
         positions: (C, 3) centres of the cells, m.
         normals: (C, 3) outward unit normals.
         points: (C, 3, 3) the three force points of each cell, m.
@@ -65,9 +74,27 @@ class Skin:
         return self.positions.shape[0]
 
     @classmethod
-    def load(cls) -> "Skin":
-        """The HSR's skin, float64, from ``assets/skin.json``."""
-        patches = json.loads(asset_path("skin.json").read_text(encoding="utf-8"))["patches"]
+    def load(cls, path: Path | None = None) -> "Skin":
+        """A skin from its file, float64.
+
+        Args:
+            path: what ``save`` or ``hasm-skin`` wrote; by default the HSR's ``assets/skin.json``.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: the file holds no skin.
+        """
+        file = asset_path("skin.json") if path is None else path
+        try:
+            return cls._of(json.loads(file.read_text(encoding="utf-8"))["patches"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{file} holds no skin: expected patches with name, link and cells of position, "
+                f"normal and three points ({type(error).__name__}: {error})"
+            ) from error
+
+    @classmethod
+    def _of(cls, patches: list[dict[str, Any]]) -> "Skin":
         slices, start = {}, 0
         for patch in patches:
             slices[patch["name"]] = slice(start, start + len(patch["cells"]))
@@ -80,6 +107,7 @@ class Skin:
                 )
             )
             for patch in patches
+            if "surface" in patch
         }
         positions, normals, points = (
             torch.tensor(
@@ -89,6 +117,30 @@ class Skin:
         )
         link = {patch["name"]: patch["link"] for patch in patches}
         return cls(tuple(slices), slices, link, surfaces, positions, normals, points)
+
+    def save(self, path: Path) -> None:
+        """Write the skin as ``load`` reads it.
+
+        Args:
+            path: JSON to write; an existing one is replaced.
+        """
+        patches = []
+        for name in self.patches:
+            span = self.slices[name]
+            parts = (self.positions[span], self.normals[span], self.points[span])
+            cells = [
+                {"position": position, "normal": normal, "points": points}
+                for position, normal, points in zip(*(part.tolist() for part in parts))
+            ]
+            patch: dict[str, Any] = {"name": name, "link": self.link[name]}
+            if box := self.surfaces.get(name):
+                patch["surface"] = {
+                    part: getattr(box, part).tolist() for part in ("centre", "half_size", "axes")
+                }
+            patches.append(patch | {"cells": cells})
+        text = json.dumps({"about": ABOUT, "patches": patches}, indent=1)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n", encoding="utf-8")
 
     def poses(self, kinematics: Kinematics, q: Tensor) -> tuple[Tensor, Tensor]:
         """Where the cells are and which way they face.

@@ -1,8 +1,12 @@
 """Simulation of the touched HSR: importing this registers "hasm_torch/HSRTouch-v0"."""
 
-import gymnasium as gym
+from hasm_torch._extras import require
 
-from hasm_torch.sim.env import MAX_EPISODE_STEPS, HSRTouchEnv
+require("sim")
+
+import gymnasium as gym  # noqa: E402
+
+from hasm_torch.sim.env import MAX_EPISODE_STEPS, HSRTouchEnv  # noqa: E402
 
 __all__ = ["HSRTouchEnv"]
 

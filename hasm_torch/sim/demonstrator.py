@@ -58,7 +58,7 @@ class Recorder:
 
     Args:
         teacher: Answers the touches.
-        start: (J,) start positions of `JOINTS`, rad or m.
+        start: (J,) start positions of the joints, rad or m.
         place: Displacement of the object in x and y, m.
     """
 
@@ -137,13 +137,35 @@ def yield_episodes(count: int, torso: bool, generator: np.random.Generator) -> I
     for index in range(count):
         start = random_posture(env.joint_lower, env.joint_upper, generator)
         start[base] = generator.uniform(-1.0, 1.0, 3) * (BASE_PLACE, BASE_PLACE, np.pi)
-        recorder = Recorder(teacher, start)
-        recorder.steps(0.1)
-        for patch in generator.permutation(patches).tolist():
-            push(recorder, teacher, patch, generator)
-            recorder.steps(PUSH_GAP)
-        yield recorder.episode(index, YIELD_TORSO if torso else YIELD_WRIST)
+        task = YIELD_TORSO if torso else YIELD_WRIST
+        yield pushed_in_turn(teacher, start, patches, generator, index, task)
     env.close()
+
+
+def pushed_in_turn(
+    teacher: YieldTeacher,
+    start: Array,
+    patches: Sequence[str],
+    generator: np.random.Generator,
+    index: int,
+    task: str,
+) -> Episode:
+    """Record one episode in which patches are pushed, each once, in random order.
+
+    Args:
+        teacher: Answers the pushes; of any robot.
+        start: (J,) where the robot starts, rad or m.
+        patches: Patches to push.
+        generator: Draws order, cells, tilt and tremor.
+        index: Number of the episode.
+        task: What is done, in words.
+    """
+    recorder = Recorder(teacher, start)
+    recorder.steps(0.1)
+    for patch in generator.permutation(patches).tolist():
+        push(recorder, teacher, patch, generator)
+        recorder.steps(PUSH_GAP)
+    return recorder.episode(index, task)
 
 
 def push(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hasm_torch.kernels.compiling import compile_kernel
 from hasm_torch.robot import Skin
-from hasm_torch.sim.scene import FINGER_MASS, FINGER_RADIUS, FINGERS, TIMESTEP
+from hasm_torch.sim.assemble import FINGER_MASS, FINGER_RADIUS, FINGERS, TIMESTEP
 
 Array = NDArray[np.float64]
 
@@ -279,5 +279,22 @@ class Hand:
         points = self._positions[span]
         if cell is not None and not 0 <= cell < len(points):
             raise ValueError(f"cell of {patch} must be 0 to {len(points) - 1}, got {cell}")
-        point = points.mean(0) if cell is None else points[cell]
-        return Push(self._links[patch], point, self._normals[span][0], float(force), cell)
+        point, normal = pushed_point(points, self._normals[span], cell)
+        return Push(self._links[patch], point, normal, float(force), cell)
+
+
+def pushed_point(points: Array, normals: Array, cell: int | None) -> tuple[Array, Array]:
+    """Point of a patch that is pushed and the outward unit normal there, (3,) each.
+
+    Args:
+        points: (n, 3) centres of the patch's cells, m.
+        normals: (n, 3) their outward unit normals.
+        cell: Which cell; None: the patch's centre, on a curved patch the cell that is nearest.
+    """
+    if cell is not None:
+        return points[cell], normals[cell]
+    middle = points.mean(0)
+    if (normals == normals[0]).all():
+        return middle, normals[0]
+    nearest = int(((points - middle) ** 2).sum(1).argmin())
+    return points[nearest], normals[nearest]

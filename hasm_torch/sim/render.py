@@ -3,15 +3,16 @@
 import importlib
 import os
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from hasm_torch.robot import BASE_FRAME, Skin
-from hasm_torch.sim.finger import Finger
-from hasm_torch.sim.scene import FINGER_RADIUS
+from hasm_torch.sim.assemble import FINGER_RADIUS
+from hasm_torch.sim.finger import Finger, pushed_point
+from hasm_torch.sim.skin_layout import cell_axes
 
 Array = NDArray[np.float64]
 
@@ -25,11 +26,6 @@ _SLEEVE_COLOUR = np.array([0.25, 0.35, 0.6, 1.0])
 _CELL_COLOURS = np.array(
     [[0.13, 0.3, 0.24], [0.95, 0.85, 0.1], [1.0, 0.45, 0.05], [0.95, 0.1, 0.05]]
 )
-# Of the camera that follows: what it looks at, distance, azimuth and elevation.
-_FOLLOWING = {
-    "compliance": ((0.26, 0.0, 0.72), 1.3, 126.0, -16.0),
-    "grasp": ((0.36, 0.0, 0.74), 1.3, 126.0, -18.0),
-}
 # It goes along with the base by this share of its way and stands back by the rest: what the base
 # leaves behind stays in the picture.
 _ALONG = 0.6
@@ -37,6 +33,31 @@ _ALONG = 0.6
 _PARALLEL = {"top": (90.0, -90.0), "side": (90.0, 0.0)}
 EXTENTS = {"top": (-0.9, 1.5, -0.9, 0.9), "side": (-0.9, 1.5, -0.1, 1.7)}
 """Left, right, bottom and top of these two pictures in `odom`, m: x and y, and x and z."""
+
+
+class View(NamedTuple):
+    """How the camera that follows looks at a robot.
+
+    Attributes:
+        middle: What it looks at while the base stands at 0, m.
+        distance: m.
+        azimuth: Degrees.
+        elevation: Degrees.
+        base: Body of a mobile base that it follows; "" for a robot that stands.
+    """
+
+    middle: tuple[float, float, float]
+    distance: float
+    azimuth: float
+    elevation: float
+    base: str = ""
+
+
+VIEWS = {
+    "compliance": View((0.26, 0.0, 0.72), 1.3, 126.0, -16.0, BASE_FRAME),
+    "grasp": View((0.36, 0.0, 0.74), 1.3, 126.0, -18.0, BASE_FRAME),
+}
+"""The HSR's views."""
 
 
 class SceneRenderer:
@@ -48,7 +69,7 @@ class SceneRenderer:
     Args:
         model: Model of the scene.
         skin: Geometry of the cells.
-        scene: "compliance" or "grasp": where the camera that follows starts.
+        view: Of the camera that follows.
 
     Raises:
         RuntimeError: No OpenGL context can be made.
@@ -57,7 +78,7 @@ class SceneRenderer:
     # A second attempt after a failed one can end the process, so the first answer stands.
     _failure: ClassVar[str | None] = None
 
-    def __init__(self, model: mujoco.MjModel, skin: Skin, scene: str) -> None:
+    def __init__(self, model: mujoco.MjModel, skin: Skin, view: View) -> None:
         if SceneRenderer._failure is not None:
             raise RuntimeError(SceneRenderer._failure)
         try:
@@ -74,7 +95,8 @@ class SceneRenderer:
             raise RuntimeError(SceneRenderer._failure) from error
         self._scene_options = mujoco.MjvOption()
         self._visual = model.vis.global_
-        self._scene, self._base = scene, model.body(BASE_FRAME).id
+        self._following = view
+        self._base = model.body(view.base or "world").id
         self._angle = float(self._visual.fovy)
         self._hexagon = model.mesh("cell").id
         # The compiler turns a mesh onto its principal axes; drawing turns it back.
@@ -82,13 +104,13 @@ class SceneRenderer:
         mujoco.mju_quat2Mat(turned_back, model.mesh_quat[self._hexagon])
         self._patches = []
         positions, normals = skin.positions.numpy(), skin.normals.numpy()
-        self._centres: dict[str, tuple[int, Array, Array]] = {}
+        self._cells: dict[str, tuple[int, Array, Array]] = {}
         for name in skin.patches:
             span, body = skin.slices[name], model.body(skin.link[name]).id
-            rotation = _cell_rotation(normals[span][0], skin.points.numpy()[span][0])
-            rotation = rotation @ turned_back.reshape(3, 3)
-            self._patches.append((span, body, positions[span], rotation))
-            self._centres[name] = (body, positions[span].mean(0), normals[span][0])
+            cells = zip(normals[span], skin.points.numpy()[span], strict=True)
+            turned = [cell_axes(*cell).T @ turned_back.reshape(3, 3) for cell in cells]
+            self._patches.append((span, body, positions[span], turned))
+            self._cells[name] = (body, positions[span], normals[span])
 
     def render(
         self,
@@ -116,12 +138,12 @@ class SceneRenderer:
         scene = self._renderer.scene
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         colours = _colours(forces.sum(1))
-        for span, body, positions, rotation in self._patches:
+        for span, body, positions, rotations in self._patches:
             frame = data.xmat[body].reshape(3, 3)
             world = data.xpos[body] + positions @ frame.T
-            turned = (frame @ rotation).ravel()
-            for position, colour in zip(world, colours[span], strict=True):
-                geom = _add(scene, mujoco.mjtGeom.mjGEOM_MESH, np.ones(3), position, turned, colour)
+            for place, rotation, colour in zip(world, rotations, colours[span], strict=True):
+                turned = (frame @ rotation).ravel()
+                geom = _add(scene, mujoco.mjtGeom.mjGEOM_MESH, np.ones(3), place, turned, colour)
                 geom.dataid = 2 * self._hexagon
         for patch, finger in touching.items():
             self._draw_finger(data, scene, patch, finger)
@@ -135,7 +157,7 @@ class SceneRenderer:
         """A camera, for the place of the base, (3,), m."""
         view = mujoco.MjvCamera()
         if camera == "follow":
-            middle, distance, view.azimuth, view.elevation = _FOLLOWING[self._scene]
+            middle, distance, view.azimuth, view.elevation, _ = self._following
             view.lookat[:] = middle + _ALONG * base
             view.distance = distance + (1 - _ALONG) * float(np.linalg.norm(base))
             self._visual.fovy = self._angle
@@ -157,8 +179,9 @@ class SceneRenderer:
     def _draw_finger(
         self, data: mujoco.MjData, scene: mujoco.MjvScene, patch: str, finger: Finger
     ) -> None:
-        body, centre, normal = self._centres[patch]
+        body, positions, normals = self._cells[patch]
         frame = data.xmat[body].reshape(3, 3)
+        centre, normal = pushed_point(positions, normals, finger.cell)
         outward = frame @ normal
         tip = data.xpos[finger.body].copy()
         if tip[2] < 0:
@@ -181,13 +204,6 @@ def _choose_backend() -> None:
     used = importlib.import_module("mujoco.rendering.classic.gl_context")
     if chosen in ("egl", "osmesa") and f"mujoco.{chosen}" != used.GLContext.__module__:
         importlib.reload(used)
-
-
-def _cell_rotation(normal: Array, points: Array) -> Array:
-    """Axes of a cell as columns: a flat side of the hexagon faces the first force point."""
-    along = points[0] - points.mean(0)
-    along /= np.linalg.norm(along)
-    return np.column_stack([along, np.cross(normal, along), normal])
 
 
 def _colours(forces: Array) -> Array:

@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hasm_torch.robot import Skin
+from hasm_torch.sim.add_skin import plates
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ class SkinSensor:
             the world's frame: the sum of its contact normal forces.
 
     Args:
-        model: Model whose geoms "skin/<patch>" are the patches.
+        model: Model with the geoms that ``add_skin`` gave to the patches.
         skin: Geometry of the cells.
     """
 
@@ -48,7 +49,8 @@ class SkinSensor:
         self._geom_patch = np.full(model.ngeom, -1)
         self._slices, self._points, self._bodies = [], [], []
         for index, name in enumerate(skin.patches):
-            self._geom_patch[model.geom(f"skin/{name}").id] = index
+            geoms = [model.geom(plate.name).id for plate in plates(skin, name)]
+            self._geom_patch[geoms] = index
             self._slices.append(skin.slices[name])
             self._points.append(points[skin.slices[name]])
             self._bodies.append(model.body(skin.link[name]).id)

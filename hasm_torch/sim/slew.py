@@ -14,32 +14,47 @@ Array = NDArray[np.float64]
 
 # Under a push a joint gives way by about a milliradian: the reference keeps that much distance
 # from the limits and from the speed limits, so that the measured values keep within them.
-_LIMIT_MARGIN = np.where(np.isin(JOINTS, METRES), 0.0005, 0.002)  # m or rad
+_MARGIN, _MARGIN_OF_SLIDES = 0.002, 0.0005  # rad, m
 _SPEED_SHARE = 0.95
 _LARGEST_LEAD = 0.03  # rad or m, of the reference over a joint that something blocks
-_ARM_TIME_TO_FULL_SPEED = 0.1  # s
-# The hand starts more gently: a grip lets go with a jerk. The base takes 0.95 m/s^2 of the
+_TIME_TO_FULL_SPEED = 0.1  # s
+# The HSR's hand starts more gently: a grip lets go with a jerk. The base takes 0.95 m/s^2 of the
 # 1.67 m/s^2 that its drive wheels can do (41.7 rad/s^2 at a radius of 0.04 m), and turns with as
 # little: half the wheels' tread of 0.266 m at 4.75 rad/s^2 is 0.63 m/s^2.
-_TIME_TO_FULL_SPEED = {"hand_motor_joint": 0.25, "odom_x": 0.2, "odom_y": 0.2, "odom_t": 0.2}  # s
+_GENTLE = {"hand_motor_joint": 0.25, "odom_x": 0.2, "odom_y": 0.2, "odom_t": 0.2}  # s
 
 
-def hsr_reference(
-    lower: Array, upper: Array, velocity: Array, tick: float, substeps: int
+def drive_reference(
+    lower: Array,
+    upper: Array,
+    velocity: Array,
+    slides: NDArray[np.bool_],
+    tick: float,
+    substeps: int,
+    times: Array | float = _TIME_TO_FULL_SPEED,
 ) -> "SlewedReference":
-    """The reference of the HSR's `JOINTS`, with which measured values keep within the limits.
+    """A reference with which measured values keep within the limits.
 
     Args:
         lower: (J,) lower joint limits, rad or m; minus infinity where there is none.
         upper: (J,) upper joint limits, rad or m; infinity where there is none.
         velocity: (J,) speed limits, rad/s or m/s.
+        slides: (J,) whether a joint slides.
         tick: Length of a control tick, s.
         substeps: Physics steps a tick.
+        times: (J,) or one, from rest to full speed, s.
     """
-    speed = _SPEED_SHARE * velocity
-    times = np.array([_TIME_TO_FULL_SPEED.get(name, _ARM_TIME_TO_FULL_SPEED) for name in JOINTS])
-    limits = lower + _LIMIT_MARGIN, upper - _LIMIT_MARGIN
-    return SlewedReference(*limits, speed, speed / times, tick, substeps)
+    speed, margin = _SPEED_SHARE * velocity, np.where(slides, _MARGIN_OF_SLIDES, _MARGIN)
+    return SlewedReference(lower + margin, upper - margin, speed, speed / times, tick, substeps)
+
+
+def hsr_reference(
+    lower: Array, upper: Array, velocity: Array, tick: float, substeps: int
+) -> "SlewedReference":
+    """The reference of the HSR's `JOINTS`, see ``drive_reference``."""
+    times = np.array([_GENTLE.get(name, _TIME_TO_FULL_SPEED) for name in JOINTS])
+    slides = np.isin(JOINTS, METRES)
+    return drive_reference(lower, upper, velocity, slides, tick, substeps, times)
 
 
 class SlewedReference:

@@ -8,6 +8,7 @@ demonstrations and to show what a memory can reach at best.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -15,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hasm_torch.robot import JOINTS
-from hasm_torch.sim.env import CONTROL_RATE, HSRTouchEnv
+from hasm_torch.robot import JOINTS, PATCHES
+from hasm_torch.sim.env import HSRTouchEnv
 from hasm_torch.sim.grasp_path import grasp_poses
 from hasm_torch.sim.scene import OBJECT_POSITION
 from hasm_torch.sim.tasks import (
@@ -32,6 +33,7 @@ from hasm_torch.sim.tasks import (
     YIELD_DAMPING,
     YIELD_GAIN,
 )
+from hasm_torch.sim.touch_env import CONTROL_RATE, TouchEnv
 
 Array = NDArray[np.float64]
 
@@ -44,6 +46,10 @@ LEAD_TIME = 0.15
 _STAGES = {REACH_PATCH: ("before", "around"), GRASP_PATCH: ("closed", "lifted")}
 
 
+HSR_LED = {patch: BASE_JOINTS[:2] if patch in TORSO_PATCHES else ARM_JOINTS for patch in PATCHES}
+"""Joints of the HSR that yield to each patch: those of the torso lead the base, others the arm."""
+
+
 class Teacher(ABC):
     """A law that moves the target of the joints, rolled out like any other policy.
 
@@ -54,7 +60,7 @@ class Teacher(ABC):
         env: The simulation in which it is rolled out.
     """
 
-    def __init__(self, env: HSRTouchEnv) -> None:
+    def __init__(self, env: TouchEnv) -> None:
         self.env = env
         self.reset()
 
@@ -102,21 +108,23 @@ class Teacher(ABC):
 class YieldTeacher(Teacher):
     """Every touched point moves at `YIELD_GAIN` times the force that the finger applies to it.
 
-    Torso patches lead the base's x and y, all others the arm. Several touches add up. The joint
-    speeds are damped least squares, weighted by the squared speed limits W:
-    ``W Jᵀ (J W Jᵀ + λ² I)⁻¹ v`` with the (3, n) Jacobian J of the pushed point.
+    Several touches add up. The joint speeds are damped least squares, weighted by the squared speed
+    limits W: ``W Jᵀ (J W Jᵀ + λ² I)⁻¹ v`` with the (3, n) Jacobian J of the pushed point.
 
     Attributes:
         tilt: (3, 3) rotation from the force to the direction in which the point is led. The
             finger is frictionless, so its force is normal to the skin; a human who teaches leads
             a link a little beside the normal.
+
+    Args:
+        env: The simulation in which it is rolled out.
+        led: Joints that each patch leads, by default those of the HSR.
     """
 
-    def __init__(self, env: HSRTouchEnv) -> None:
+    def __init__(self, env: TouchEnv, led: Mapping[str, Sequence[str]] = HSR_LED) -> None:
         super().__init__(env)
-        self._dofs = np.array([int(env.model.joint(name).dofadr[0]) for name in JOINTS])
-        self._arm = np.isin(JOINTS, ARM_JOINTS)
-        self._base = np.isin(JOINTS, BASE_JOINTS[:2])
+        self._dofs = np.array([int(env.model.joint(name).dofadr[0]) for name in env.joints])
+        self._led = {patch: np.isin(env.joints, led[patch]) for patch in env.skin.patches}
 
     def reset(self) -> None:
         """Start a new rollout, led along the force."""
@@ -125,13 +133,13 @@ class YieldTeacher(Teacher):
 
     def _move(self, target: Array, measured: Array, felt: dict[str, float]) -> Array:
         model, data = self.env.model, self.env.data
-        speed = np.zeros(len(JOINTS))
+        speed = np.zeros(len(self.env.joints))
         jacobian = np.zeros((3, model.nv))
         mujoco.mj_comPos(model, data)  # the Jacobian needs it up to date
         for touch in self.env.touch_points():
             link = model.body(self.env.skin.link[touch.patch]).id
             mujoco.mj_jac(model, data, jacobian, None, touch.point, link)
-            led = self._base if touch.patch in TORSO_PATCHES else self._arm
+            led = self._led[touch.patch]
             weights = self.env.joint_speed_limit[led] ** 2
             wanted = YIELD_GAIN * self.tilt @ touch.force
             speed[led] += damped_least_squares(jacobian[:, self._dofs[led]], weights, wanted)
@@ -174,6 +182,8 @@ class GraspTeacher(Teacher):
 
     The speed along the path is proportional to the felt force.
     """
+
+    env: HSRTouchEnv
 
     def reset(self) -> None:
         """Start a new rollout."""

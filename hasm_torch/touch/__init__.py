@@ -4,3 +4,7 @@ page ──commands──► Session (50 Hz) ──► HSRTouchEnv
 ▲                   │   ▲
 └──── Snapshot ◄────┘   └── Learner (a thread of its own) ──► Shelf (files)
 """
+
+from hasm_torch._extras import require
+
+require("touch")

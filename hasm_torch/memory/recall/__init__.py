@@ -15,6 +15,7 @@ from hasm_torch.memory.recall.packed import (
     recall_packed,
     store,
     unpack,
+    warm_up,
     weights_packed,
 )
 
@@ -32,6 +33,7 @@ __all__ = [
     "recall_packed",
     "store",
     "unpack",
+    "warm_up",
     "weights_dense",
     "weights_packed",
 ]

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from hasm_torch import kernels
+from hasm_torch.kernels.aside import Aside
 from hasm_torch.memory.recall.dense import (
     Recall,
     Stored,
@@ -148,12 +149,16 @@ def _compiled(memory: Stored) -> bool:
 
 def _straight(query: Tensor, memory: Stored) -> bool:
     """Whether it is called without the dispatcher, which takes as long as the scan of one query."""
-    return query.is_cpu and not torch.compiler.is_compiling() and _compiled(memory)
+    if not query.is_cpu or torch.compiler.is_compiling() or not _compiled(memory):
+        return False
+    return _compiled_scan.ready()
 
 
 def _recall(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:
     """Decision, match, and score, margin and entropy stacked."""
     if not _compiled(memory):
+        return _by_torch(query, memory)
+    if query.is_cpu and not torch.compiler.is_compiling() and not _compiled_scan.ready():
         return _by_torch(query, memory)
     *arguments, interaction, top_k = memory
     found: tuple[Tensor, Tensor, Tensor] = torch.ops.hasm_torch.packed_recall(
@@ -216,12 +221,28 @@ def _distances_gpu() -> Callable[[Tensor, Tensor], Tensor]:
     return distances_gpu
 
 
-@functools.cache
-def _scan_cpu() -> Callable[..., None]:
-    """The compiled scan; numba loads in about 0.5 s."""
+def _load_scan() -> Callable[..., None]:
+    """The compiled scan, compiled by running it once."""
     from hasm_torch.memory.recall.packed_cpu import scan_cpu
 
+    words, held = torch.zeros(1, 1, ROWS, dtype=torch.int32), torch.ones((), dtype=torch.int64)
+    query, successors, decision = torch.zeros(3, 1).split(1)
+    memory = query[0], words, successors, held, None
+    scan_cpu(*memory, beta=1.0, interaction="softmax", top_k=None, decision=decision[0])
     return scan_cpu
+
+
+_compiled_scan = Aside(_load_scan)
+
+
+def warm_up() -> None:
+    """Wait until the packed recall on the CPU is compiled, which takes seconds once a machine.
+
+    Until then a recall runs as torch operations and agrees with the compiled one to within
+    rounding.
+    """
+    if kernels.enabled():
+        _compiled_scan.get()
 
 
 def _scan(query: Tensor, memory: Stored, **wanted: Any) -> None:
@@ -235,7 +256,7 @@ def _scan(query: Tensor, memory: Stored, **wanted: Any) -> None:
     if held is not None and held.ndim != words.ndim - 3:
         held = held.expand(words.shape[:-3])
     tensors = [t if t is None else t.contiguous() for t in (query, words, successors, held, mask)]
-    _scan_cpu()(*tensors, value, interaction, top_k, **wanted)
+    _compiled_scan.get()(*tensors, value, interaction, top_k, **wanted)
 
 
 def _scan_all(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:

@@ -212,7 +212,7 @@ def compare(job, part):
                         second = max(distance, least)
                         if distance < least:
                             least, match = distance, row
-            found[:] = least, second, match
+            found[0], found[1], found[2] = least, second, match
             job.number[part, query] = number
 
 

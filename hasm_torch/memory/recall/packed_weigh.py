@@ -29,14 +29,17 @@ def weigh(job):
         found, counts, table = job.found[0, query], job.counts[0, query], job.table[query]
         for part in range(1, len(job.found)):
             _merge(found, job.found[part, query])
-            counts += job.counts[part, query]
+            for distance in range(dim + 1):
+                counts[distance] += job.counts[part, query, distance]
         least = found[0]
         if least == FAR:
             if len(job.match) > 0:
                 job.match[query] = -1
-                job.certainty[:, query] = math.nan
+                for number in range(3):
+                    job.certainty[number, query] = math.nan
             if len(job.weights) > 0 and job.kind >= SOFTMAX:
-                job.weights[query] = math.nan
+                for row in range(job.weights.shape[1]):
+                    job.weights[query, row] = math.nan
             continue
         last, taking_part = least, counts[least]
         while last < min(least + job.slack, dim) and not 0 < job.top_k <= taking_part:
@@ -86,7 +89,8 @@ def _fill(table, counts, least, last, beta, kind):
         table[distance] = weight
         weighed += counts[distance] * weight
     if kind >= SOFTMAX:
-        table[least : last + 1] /= weighed
+        for distance in range(least, last + 1):
+            table[distance] /= weighed
 
 
 @njit(nogil=True, cache=True)
