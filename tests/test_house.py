@@ -5,7 +5,15 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-BELOW = ("_assets", "_extras", "_headless", "body", "config", "episode")  # modules that all may use
+BELOW = (
+    "_assets",
+    "_commands",
+    "_extras",
+    "_headless",
+    "body",
+    "config",
+    "episode",
+)  # modules that all may use
 FLOORS = ("kernels", "encoders", "memory", "model", "robot", "sim", "data", "evaluation", "touch",
           "ros", "lerobot", "apps", "__init__")  # fmt: skip
 MODULES = {

@@ -11,6 +11,7 @@ from unittest import mock
 
 import numpy as np
 
+from hasm_torch._extras import require
 from hasm_torch.data.checks import check_finite
 from hasm_torch.data.skin import UNKNOWN_UNIT, SkinPatch, skin_to_info
 from hasm_torch.episode import ACTION, STATE, TACTILE, Episode
@@ -90,6 +91,7 @@ def _write(
     fps: int,
     robot_type: str,
 ) -> None:
+    require("lerobot")
     from lerobot.datasets import dataset_writer as writer
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils.utils import SuppressProgressBars

@@ -24,7 +24,7 @@ from hasm_torch.config import HASMConfig
 from hasm_torch.encoders.readings import forces_of
 from hasm_torch.encoders.skin import SkinEncoder
 from hasm_torch.memory.recall import warm_up
-from hasm_torch.model import checkpoint, predict
+from hasm_torch.model import checkpoint, hub, predict
 from hasm_torch.model.choose import ARGMAX_BETA
 from hasm_torch.model.control import Array, Rollout, limit_speed
 from hasm_torch.model.explain import Explanation, explained, explained_moment
@@ -438,20 +438,41 @@ class HASM(nn.Module):
             Path(directory),
         )
 
-    @classmethod
-    def from_pretrained(cls, directory: str | Path) -> "HASM":
-        """Load what ``save_pretrained``, ``train.py`` or LeRobot's training wrote.
+    def push_to_hub(self, name: str, private: bool = False) -> str:
+        """Put a checkpoint with a model card on the Hugging Face hub.
+
+        Args:
+            name: "user/name" of the repository, made if it is not there.
+            private: Whether a repository that is made is private.
+
+        Returns:
+            Address of the commit.
 
         Raises:
-            FileNotFoundError: If a file is missing.
+            RuntimeError: If the model has learned nothing.
+        """
+        self._learned()
+        return hub.push(self, name, private)
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> "HASM":
+        """Load what ``save_pretrained``, ``train.py`` or LeRobot's training wrote.
+
+        Args:
+            name: A folder, or "user/name" of a repository of the Hugging Face hub.
+            revision: Branch, tag or commit of the repository.
+
+        Raises:
+            FileNotFoundError: If there is neither, or a file is missing.
             ValueError: If a file is damaged, holds no memory, or does not belong to the other.
         """
-        settings = checkpoint.read_settings(Path(directory))
+        directory = hub.found(name, revision)
+        settings = checkpoint.read_settings(directory)
         try:
             model = cls(settings.config, settings.body, settings.settled)
         except (ValueError, LookupError, TypeError, RuntimeError) as error:
-            raise checkpoint.damaged(Path(directory), error) from error
-        checkpoint.load_weights(model, Path(directory))
+            raise checkpoint.damaged(directory, error) from error
+        checkpoint.load_weights(model, directory)
         return model
 
 

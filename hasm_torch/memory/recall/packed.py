@@ -130,6 +130,8 @@ def _checked(query: Tensor, memory: Stored) -> Stored:
             f"{width} words a code, got {query.shape[-1]}"
         )
     if not isinstance(memory.beta, Tensor):
+        if math.isnan(memory.beta):
+            raise ValueError("expected beta to be a number, got NaN")
         exact = torch.float64 if query.is_cpu else torch.float32
         memory = memory._replace(beta=torch.tensor(memory.beta, dtype=exact, device=query.device))
     if memory.held is None:
@@ -144,7 +146,9 @@ def _compiled(memory: Stored) -> bool:
     learning = successors.requires_grad or (isinstance(beta, Tensor) and beta.requires_grad)
     if learning and torch.is_grad_enabled():
         return False
-    return successors.dtype == torch.float32 and kernels.enabled()
+    if successors.dtype != torch.float32:
+        return False
+    return torch.compiler.is_compiling() or kernels.enabled()  # compiled, the operator asks
 
 
 def _straight(query: Tensor, memory: Stored) -> bool:
@@ -259,6 +263,11 @@ def _scan(query: Tensor, memory: Stored, **wanted: Any) -> None:
     _compiled_scan.get()(*tensors, value, interaction, top_k, **wanted)
 
 
+def _recall_cpu(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:
+    """``_recall`` in a compiled or exported program, which waits for the scan."""
+    return (_scan_all if kernels.enabled() else _by_torch)(query, memory)
+
+
 def _scan_all(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:
     """``_recall`` by the scan on the CPU."""
     decision, match, certainty = _room(query, memory)
@@ -294,6 +303,6 @@ _library.define(
     "-> (Tensor decision, Tensor match, Tensor certainty)",
     tags=(torch.Tag.pt2_compliant_tag,),
 )
-_library.impl("packed_recall", _operator(_scan_all), "CPU")
+_library.impl("packed_recall", _operator(_recall_cpu), "CPU")
 _library.impl("packed_recall", _operator(_by_torch), "CompositeExplicitAutograd")
 torch.library.register_fake("hasm_torch::packed_recall", _operator(_room), lib=_library)
