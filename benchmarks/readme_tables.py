@@ -194,7 +194,11 @@ def skin_filter(measured: dict[str, Any]) -> str:
 def another_robot(measured: dict[str, Any]) -> str:
     """Yielding of a robot that the code was not written for."""
     rows = [
-        [name, f"{found['share_07_of_teacher']:.2f}", f"{found['travel_of_teacher'] + 0:.2f}"]
+        [
+            name,
+            f"{found['share_07_of_teacher']:.2f}",
+            f"{round(found['travel_of_teacher'], 2) + 0:.2f}",
+        ]
         for name, found in measured["tested"].items()
     ]
     return markdown(("", "`share_07_of_teacher`", "`travel_of_teacher`"), rows)

@@ -55,7 +55,7 @@ def test_a_folder_of_that_name_comes_first(model, cache):
 
 
 def test_what_is_neither_folder_nor_repository_is_named(cache):
-    with pytest.raises(FileNotFoundError, match="expected a folder .* or a repository .*lab/none"):
+    with pytest.raises(FileNotFoundError, match=r"expected a folder .* or a repository .*lab/none"):
         HASM.from_pretrained("lab/none")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         HASM.from_pretrained("nowhere")

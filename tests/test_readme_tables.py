@@ -1,10 +1,15 @@
 """One command writes the tables of all pages, from results that are there."""
 
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 
 from benchmarks import readme_tables
+from benchmarks.machine import RESULTS
+
+ROOT = Path(__file__).resolve().parents[1]
 
 PAGE = "before\n<!-- table:{0} -->\nstale\n<!-- /table:{0} -->\nafter\n"
 
@@ -94,6 +99,42 @@ def test_tables_of_all_pages_are_written(tmp_path, evaluated):
     again = readme_tables.write(tmp_path / "results", tmp_path)
     assert again == done
     assert (tmp_path / "README.md").read_text() == readme
+
+
+def test_tables_of_speed_and_of_another_robot(tmp_path, evaluated):
+    size = {"rows": 100000, "dim": 400, "batch": 1}
+    results = {
+        "another_robot": {"tested": {"standing still": along(0.0) | {"travel_of_teacher": -1e-9}}},
+        "recall": {"results": [
+            size | {"contestant": "hasm_torch packed", "seconds": 0.0012},
+            size | {"contestant": "torch SDPA", "seconds": 1.2037},
+        ]},
+        "izhikevich": {"work": {"long run": {"neurons": 1000, "steps": 10000, "ratio": 18.56,
+                                             "median_s": {"ours": 0.1326, "norse": 2.4657}}}},
+        "eval_default": evaluated,
+    }  # fmt: skip
+    names = ("another_robot", "recall", "izhikevich", "resources")
+    page = "".join(PAGE.format(name) for name in names)
+    assert len(readme_tables.write(*folder(tmp_path, results, speed=page))) == 4
+    speed = (tmp_path / "docs/speed.md").read_text()
+    assert "| standing still | 0.00 | 0.00 |" in speed
+    assert "| 100,000 x 400, 1 | 1.2 ms |  |  | 1,204 ms |" in speed
+    assert "| long run, 1,000 x 10,000 | 133 ms | 2,466 ms | 18.6 |" in speed
+    assert "| memory, bytes | ≤ 1,000,000 | 1,234,567 |" in speed
+    assert "| control step, 99 of 100, ms |  | 1 |" in speed
+
+
+def test_what_the_pages_say_is_what_the_results_say(tmp_path):
+    """The committed tables are those that the committed results make."""
+    (tmp_path / "docs").mkdir()
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    for page in pages:
+        shutil.copy(page, tmp_path / page.relative_to(ROOT))
+    done = readme_tables.write(RESULTS, tmp_path)
+    assert len(done) >= 16
+    assert not [line for line in done if "stays as it is" in line or "no table" in line]
+    for page in pages:
+        assert (tmp_path / page.relative_to(ROOT)).read_text() == page.read_text(), page.name
 
 
 def test_a_table_without_results_stays_and_is_told(tmp_path):
