@@ -5,7 +5,7 @@ this process: policy ◄──► HSRLink ◄──topics──► SimulatedHSR 
 
 import multiprocessing
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from hasm_torch.ros.link import HSRLink, LinkConfig, Reading
 from hasm_torch.ros.simulated_hsr import SimulatedHSR
 
 PATIENCE = 0.05  # s, in which the robot's loop looks up from waiting for a sample
-FOUND = 2.0  # s in which ROS nodes of one machine find each other, with time to spare
+FOUND = 20.0  # s in which ROS nodes of one machine find each other, with time to spare
 
 _made: dict[str, Any] = {}  # what the simulation's process has made so far
 
@@ -35,40 +35,39 @@ class Rolled(NamedTuple):
 
 
 def roll_out_across(
-    experiment: str,
-    cases: Sequence[Case],
-    policy: Policy,
+    planned: Mapping[str, Sequence[Case]],
+    policies: Mapping[str, Policy],
     waits: bool,
     prefix: str = "/hsrb",
-) -> list[Rolled]:
-    """Roll cases out with the policy here and the simulation in another process.
+) -> dict[str, list[Rolled]]:
+    """Roll cases out with the policies here and the simulation in another process.
 
     Args:
-        experiment: One of ``EXPERIMENTS``.
-        cases: Its cases.
-        policy: What drives the robot.
+        planned: Cases by their experiment, of ``EXPERIMENTS``.
+        policies: What drives the robot in each.
         waits: Whether the simulation waits for commands instead of running in real time.
         prefix: Before all topics.
 
     Returns:
         What came of each case.
     """
-    config = LinkConfig(prefix, dry_run=False, object=experiment == "grasp", sim_time=waits)
-    link = HSRLink(config)
-    spawn = multiprocessing.get_context("spawn")
-    try:
-        with ProcessPoolExecutor(1, spawn, _begin, (experiment, prefix, waits)) as pool:
-            rolled = []
-            for case in cases:
-                policy.reset()
-                link.reset()
-                playing = pool.submit(_play, case)
-                drive(link, policy, playing)
-                rolled.append(playing.result())
-            pool.submit(_end).result()
-            return rolled
-    finally:
-        link.close()
+    spawn, rolled = multiprocessing.get_context("spawn"), {}
+    with ProcessPoolExecutor(1, spawn, torch.set_num_threads, (1,)) as pool:
+        for experiment, cases in planned.items():
+            link = HSRLink(LinkConfig(prefix, False, True, experiment == "grasp", waits))
+            policy, rolled[experiment] = policies[experiment], list[Rolled]()
+            try:
+                pool.submit(_begin, experiment, prefix, waits).result()
+                for case in cases:
+                    policy.reset()
+                    link.reset()
+                    playing = pool.submit(_play, case)
+                    drive(link, policy, playing)
+                    rolled[experiment].append(playing.result())
+                pool.submit(_end).result()
+            finally:
+                link.close()
+    return rolled
 
 
 def drive(link: HSRLink, policy: Policy, until: Future[Any]) -> None:
@@ -93,10 +92,14 @@ def answer(policy: Policy, reading: Reading) -> torch.Tensor:
 
 
 def _begin(experiment: str, prefix: str, waits: bool) -> None:
-    torch.set_num_threads(1)
     env = make_env(experiment)
-    _made.update(env=env, robot=SimulatedHSR(env.unwrapped, prefix, waits))
-    time.sleep(FOUND)
+    robot = SimulatedHSR(env.unwrapped, prefix, waits)
+    _made.update(env=env, robot=robot)
+    deadline = time.monotonic() + FOUND
+    while not robot.found:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"ROS nodes of one machine did not find each other in {FOUND:g} s")
+        time.sleep(PATIENCE)
 
 
 def _play(case: Case) -> Rolled:

@@ -108,7 +108,7 @@ class HSRLink:
         self._twist: Publisher | None = None
         if not config.dry_run:
             self._advertise()
-        self._spinning.node.create_timer(1 / config.safety.rate, self._watch)
+        self._spinning.every(1 / config.safety.rate, self._watch)
         self._spinning.start()
 
     # ---- What the caller does.
@@ -292,7 +292,7 @@ class HSRLink:
         def listen(kind: type, callback: Callable[..., None], *parts: str) -> None:
             name = topics.topic(self.config.prefix, *parts)
             profile = topics.COMMAND if kind is Empty else topics.SENSOR
-            self._spinning.node.create_subscription(kind, name, callback, profile)
+            self._spinning.listen(kind, name, callback, profile)
 
         listen(JointState, self._take_joints, "joint_states")
         listen(Float32MultiArray, self._take_skin, SKIN)

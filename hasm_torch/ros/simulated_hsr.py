@@ -53,7 +53,7 @@ class SimulatedHSR:
     """
 
     def __init__(self, sim: HSRTouchEnv, prefix: str = "/hsrb", waits: bool = False) -> None:
-        self._sim, self._waits = sim, waits
+        self._sim, self._waits, self._prefix = sim, waits, prefix
         self._spinning = Spinning("simulated_hsr")
         self._arrived = threading.Condition()  # holds all that callbacks change
         self._pushes: Touches = {}
@@ -70,6 +70,14 @@ class SimulatedHSR:
         """Force, N, and cell of every patch that is to be pushed."""
         with self._arrived:
             return dict(self._pushes)
+
+    @property
+    def found(self) -> bool:
+        """Whether someone listens to it and drives it."""
+        heard = (self._skin, self._joints)
+        name = topics.topic(self._prefix, f"{ARM}_controller", "command")
+        listened = all(offered.get_subscription_count() for offered in heard)
+        return listened and self._spinning.node.count_publishers(name) > 0
 
     def reset(self) -> None:
         """The robot was put elsewhere: it stays there until commanded."""
@@ -175,7 +183,7 @@ class SimulatedHSR:
     def _listen(self, prefix: str) -> None:
         def listen(kind: type, callback: Any, *parts: str) -> None:
             name = topics.topic(prefix, *parts)
-            self._spinning.node.create_subscription(kind, name, callback, topics.COMMAND)
+            self._spinning.listen(kind, name, callback, topics.COMMAND)
 
         for controller in topics.CONTROLLERS:
             callback = partial(self._take_trajectory, controller)

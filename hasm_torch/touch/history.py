@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hasm_torch.sim.env import CONTROL_RATE
+from hasm_torch.touch.live import Status
 
 Array = NDArray[np.float64]
 
@@ -120,6 +121,7 @@ class Snapshot:
         busy: What is done beside, and for how many seconds.
         step_ms: What 99 of 100 control steps take at most, ms.
         behind: Whether it falls behind real time.
+        live: What the live robot is doing; None where it is simulated.
     """
 
     mode: str
@@ -139,3 +141,4 @@ class Snapshot:
     busy: tuple[str, float] | None
     step_ms: float
     behind: bool
+    live: Status | None = None

@@ -4,7 +4,8 @@ fingers ──► HSRTouchEnv ──joints, skin──► whoever leads: guiding
                  ▲                                        │
                  └──────────────── target ◄───────────────┘
 
-One call of `step` is a control step. Nothing here knows of threads, time or pages.
+One call of `step` is a control step. Nothing here knows of threads, time or pages. A live robot is
+pushed by hand; where it is not driven, whoever leads it starts anew from where it then is.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,11 +20,13 @@ from hasm_torch.model.hasm import HASM
 from hasm_torch.robot import JOINTS
 from hasm_torch.sim.env import HSRTouchEnv
 from hasm_torch.sim.scene import OBJECT_POSITION
+from hasm_torch.sim.teacher import YieldTeacher
 from hasm_torch.touch.demonstrations import Recorder, Replay
 from hasm_torch.touch.fingers import Fingers
 from hasm_torch.touch.ghosts import Ghosts, ways
 from hasm_torch.touch.guide import HandGuide
 from hasm_torch.touch.history import History, Reason, Why
+from hasm_torch.touch.live import Live
 from hasm_torch.touch.pointing import Ray, cells_in_world, drag_force, hit_cell, patch_of
 
 Array = NDArray[np.float64]
@@ -35,7 +38,8 @@ class Lesson:
     """One robot that is taught.
 
     Attributes:
-        env: The simulation.
+        env: The simulation, or what stands for a live robot.
+        live: The live robot, or None.
         fingers: What the person pushes.
         guide: The person's guiding hand.
         model: What the robot knows; it may be empty.
@@ -48,7 +52,7 @@ class Lesson:
         history: The last seconds.
 
     Args:
-        env: The simulation.
+        env: The simulation, or what stands for a live robot.
         model: What the robot knows.
         seed: Of what resets draw.
     """
@@ -56,7 +60,9 @@ class Lesson:
     def __init__(self, env: HSRTouchEnv, model: HASM, seed: int) -> None:
         self.env = env
         self.fingers = Fingers(tuple(env.skin.patches))
+        self.live = env if isinstance(env, Live) else None
         self.guide = HandGuide(env)
+        self._yielding = YieldTeacher(env)
         self.recorder: Recorder | None = None
         self.recording = False
         self.replay: Replay | None = None
@@ -72,9 +78,10 @@ class Lesson:
         self.learn(model, ways(model))
         self._seen = env.reset(seed=seed)[0]
         self._felt = self._encoder.start()
-        self.fingers.press(env.skin.patches[0], None, 1.0)
-        self.step()  # what a push takes is compiled before the time counts
-        self.fingers.let_go()
+        if self.live is None:
+            self.fingers.press(env.skin.patches[0], None, 1.0)
+            self.step()  # what a push takes is compiled before the time counts
+            self.fingers.let_go()
         self._begin(env.reset(seed=seed)[0])
 
     # ---- What a person does.
@@ -145,7 +152,7 @@ class Lesson:
         self.replay = Replay(episode, moved)
 
     def reset(self) -> None:
-        """Put everything back; what was recorded stays."""
+        """Put everything back, but for a live robot; what was recorded stays."""
         self.stop()
         self.fingers.let_go()
         self._begin(self.env.reset()[0])
@@ -183,6 +190,9 @@ class Lesson:
     def step(self) -> None:
         """One control step."""
         replay, env = self.replay, self.env
+        if self.live is not None and not self.live.status().driven:
+            self.guide.reset()
+            self._lead_anew()
         if replay is not None and replay.finished:
             self.stop()
             replay = None
@@ -230,7 +240,11 @@ class Lesson:
             self._led = led
         if replay is not None and replay.moved:
             return replay.target
+        if self.recording and self.live is not None and not self.guide.active:
+            self.guide.start_here()
+            return self._yielding.step(state, skin).numpy().astype(np.float64)
         if led or not self.knows:
+            self._yielding.reset()
             return self.guide.step(state, skin).numpy().astype(np.float64)
         target = self.model.step(
             state, skin, self._rollout, observation, hold_below=self.hold_below
@@ -240,6 +254,7 @@ class Lesson:
     def _lead_anew(self) -> None:
         """Whoever leads next starts from where the robot is."""
         self.guide.start_here()
+        self._yielding.reset()
         self._rollout = self.model.new_rollout()
 
     def _begin(self, seen: dict[str, NDArray[np.float32]]) -> None:

@@ -140,6 +140,7 @@ class Page:
                 lambda: self._take(page),
                 self._env,
                 self.session.shelf,
+                self.session.snapshot.live is not None,
             )
 
         @self._server.on_client_disconnect
@@ -161,8 +162,8 @@ class Page:
                 self._send(event.client_id, *([do] if isinstance(do, str) else do))
 
     def _send(self, page: int | None, command: str, *arguments: Any) -> None:
-        """Pass on what the driver does; the others only watch."""
-        if page is not None and page == self.seat.driver:
+        """Pass on what the driver does; the others only watch, but anyone may stop the robot."""
+        if command == "emergency" or (page is not None and page == self.seat.driver):
             self.session.send(command, *arguments)
 
     def _take(self, page: int) -> None:

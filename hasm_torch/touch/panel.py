@@ -20,6 +20,10 @@ HELP = (
     "to let the push stay. <b>Drag the gripper</b> to guide the robot. Drag beside it to look "
     "around."
 )
+HELP_LIVE = (
+    "<b>Push the robot's skin</b> with your hand. <b>Drag the gripper</b> to guide the robot. Drag "
+    "beside it to look around."
+)
 _MODES = {"live": "The robot answers your touch", "record": "Recording", "play": "Playing"}
 _NOTHING = "nothing saved yet"
 _ROOM = 1.0  # m or rad: how far the sliders of the base reach from where it started
@@ -36,6 +40,7 @@ class Panel:
         take_over: Asks for the driver's seat.
         env: Says what patches and joints there are; it is only read.
         shelf: What can be loaded.
+        live: Whether the robot is a live one.
     """
 
     def __init__(
@@ -45,16 +50,21 @@ class Panel:
         take_over: Callable[[], None],
         env: HSRTouchEnv,
         shelf: Shelf,
+        live: bool = False,
     ) -> None:
         self._gui, self._send, self._shelf = gui, send, shelf
         self._controls: list[Any] = []
         self._state = gui.add_html("")
+        if live:
+            stop = gui.add_button("EMERGENCY STOP", color="red")
+            _when_pressed(stop, partial(send, "emergency"))  # whoever drives
+            self._button("Release", partial(send, "release"), "orange")
         self._progress = gui.add_progress_bar(100.0, animated=True, visible=False)
         self._seat = gui.add_button("Take over", color="orange", visible=False)
         _when_pressed(self._seat, take_over)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Teach"):
-            self._teach(list(env.skin.patches))
+            self._teach(list(env.skin.patches), HELP_LIVE if live else HELP)
         with tabs.add_tab("Joints"):
             self._move(env)
         with tabs.add_tab("Files"):
@@ -102,9 +112,9 @@ class Panel:
         """Push the chosen patch with the chosen force, until it is let go."""
         self._send("pin", self._patch.value, self._force.value)
 
-    def _teach(self, patches: Sequence[str]) -> None:
+    def _teach(self, patches: Sequence[str], told: str) -> None:
         gui, send = self._gui, self._send
-        gui.add_html(f'<div style="font:12px/1.35 system-ui,sans-serif;color:#444">{HELP}</div>')
+        gui.add_html(f'<div style="font:12px/1.35 system-ui,sans-serif;color:#444">{told}</div>')
         self._record = self._button("Record (R)", self.toggle, "red")
         self._button("Keep (K)", self.keep, "green")
         self._button("Forget last (F)", lambda: send("forget"))
@@ -193,12 +203,18 @@ def _told(snapshot: Snapshot, driving: bool, free: bool, pages: int) -> str:
     if snapshot.busy is not None:
         said, failed = f"{snapshot.busy[0]} … {snapshot.busy[1]:.0f} s", False
     pace = "falls behind" if snapshot.behind else "real time"
+    live, pace = "", f"{snapshot.step_ms:.0f} of 20 ms a step: {pace}"
+    if snapshot.live is not None:
+        pace = ""  # its samples give the time
+        colour = "#b03a2e" if snapshot.live.emergency else "#1e5b8f"
+        told = escape(snapshot.live.told)
+        live = f'<div class="live" style="font-weight:600;color:{colour}">{told}</div>'
     return (
         '<div style="font:12px/1.4 system-ui,sans-serif;color:#444">'
-        f'<div class="mode" style="font-size:15px;font-weight:600">{mode}</div>'
+        f'{live}<div class="mode" style="font-size:15px;font-weight:600">{mode}</div>'
         f'<div class="seat">{seat} It knows {snapshot.known} demonstrations.</div>'
         f'<div class="said" data-number="{number}" style="min-height:34px;'
         f'color:{"#b03a2e" if failed else "#1e6b4f"}">{escape(said)}</div>'
         f'<div class="pace" style="color:{"#b03a2e" if snapshot.behind else "#888"}">'
-        f"{snapshot.step_ms:.0f} of 20 ms a step: {pace}</div></div>"
+        f"{pace}</div></div>"
     )

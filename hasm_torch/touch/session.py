@@ -26,6 +26,7 @@ from hasm_torch.sim.tasks import BASE_JOINTS
 from hasm_torch.touch.history import Arrow, Snapshot, Why
 from hasm_torch.touch.learner import Learner, Outcome
 from hasm_torch.touch.lesson import Lesson
+from hasm_torch.touch.live import REFUSED
 from hasm_torch.touch.pace import Pace, come_first
 from hasm_torch.touch.pointing import Ray
 from hasm_torch.touch.shelf import Shelf
@@ -50,11 +51,19 @@ class Session:
         model: What the robot knows at the start; it may be empty.
         shelf: Where things are saved.
         seed: Of what resets draw.
+        env: What stands for a live robot, in place of a simulation; it is closed with the session.
     """
 
-    def __init__(self, scene: str, model: HASM, shelf: Shelf, seed: int = 0) -> None:
+    def __init__(
+        self,
+        scene: str,
+        model: HASM,
+        shelf: Shelf,
+        seed: int = 0,
+        env: HSRTouchEnv | None = None,
+    ) -> None:
         self.scene, self.shelf = scene, shelf
-        self.lesson = Lesson(HSRTouchEnv(scene), copy.deepcopy(model), seed)
+        self.lesson = Lesson(env or HSRTouchEnv(scene), copy.deepcopy(model), seed)
         self.pace = Pace()
         self._inbox: queue.SimpleQueue[tuple[str, tuple[Any, ...]]] = queue.SimpleQueue()
         self.learner = Learner(scene, model, shelf, lambda outcome: self.send("outcome", outcome))
@@ -88,6 +97,8 @@ class Session:
             "look": self._look,
             "save": lambda kind, name: self.learner.save(kind, name),
             "load": lambda kind, name: self.learner.load(kind, name),
+            "emergency": self._no_robot,
+            "release": self._no_robot if lesson.live is None else lesson.live.release,
             "left": self._left,
             "outcome": self._outcome,
         }
@@ -111,7 +122,13 @@ class Session:
         self.lesson.env.close()
 
     def send(self, command: str, *arguments: Any) -> None:
-        """Put a command in the queue; one that makes no sense is answered in the snapshot."""
+        """Put a command in the queue; one that makes no sense is answered in the snapshot.
+
+        An emergency stop of a live robot waits for nothing.
+        """
+        if command == "emergency" and self.lesson.live is not None:
+            self.lesson.live.emergency_stop()
+            return
         self._inbox.put((command, arguments))
 
     def load_bundled(self, datasets: Path) -> None:
@@ -131,6 +148,9 @@ class Session:
 
     def _run(self) -> None:
         come_first()
+        if self.lesson.live is not None:  # its samples give the time
+            while not self._ending.is_set():
+                self.step()
         while not self._ending.is_set():
             self.pace.begin()
             self.step()
@@ -140,6 +160,8 @@ class Session:
         try:
             if command not in self._commands:
                 raise ValueError(f"there is no {command!r} to be done")
+            if self.lesson.live is not None and command in REFUSED:
+                raise ValueError(REFUSED[command])
             self._commands[command](*arguments)
         # Whatever a page sends, the loop goes on.
         except Exception as error:
@@ -152,10 +174,13 @@ class Session:
 
     def _record(self) -> None:
         self.lesson.record()
-        self._say(
-            "Recording: push a patch, then drag the gripper or use the joint sliders. "
-            "Keep it when you are done."
-        )
+        led = "push a patch, then drag the gripper or use the joint sliders"
+        if self.lesson.live is not None:
+            led = "push the robot's skin, and it yields; the page leads it too"
+        self._say(f"Recording: {led}. Keep it when you are done.")
+
+    def _no_robot(self) -> None:
+        raise ValueError("the robot is simulated: there is nothing to be stopped")
 
     def _keep(self, task: str) -> None:
         episode = self.lesson.taken(len(self._shown), str(task).strip() or "shown by hand")
@@ -222,6 +247,7 @@ class Session:
             busy=None if busy is None else (busy[0], time.monotonic() - busy[1]),
             step_ms=self.pace.milliseconds,
             behind=self.pace.behind,
+            live=None if lesson.live is None else lesson.live.status(),
         )
 
     def _arrows(self) -> tuple[Arrow, ...]:
