@@ -110,7 +110,7 @@ def test_several_datasets_are_learned_as_one(models, tmp_path, kind):
     assert len(dataset_scenes(parts).time) == sum(len(episode) for episode in data)
 
 
-@pytest.mark.parametrize("kind", ["pressures", "bound"])
+@pytest.mark.parametrize("kind", ["bound"])
 def test_open_loop_takes_several_datasets(roots, tmp_path, kind):
     figures = []
     for number, folders in enumerate(([roots[kind]], several(kind, tmp_path))):

@@ -18,13 +18,13 @@ from hasm_torch.robot import JOINTS
 from hasm_torch.ros.link import HSRLink, LinkConfig
 from hasm_torch.ros.live_env import LiveEnv
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 # One process for all commands: their imports take longer than they do.
 COMMANDS = f"""
 import sys
 from pathlib import Path
-
-pytestmark = pytest.mark.slow
 
 def run(main, *arguments):
     sys.argv = [main.__module__, *arguments]

@@ -32,18 +32,20 @@ expected = weights @ values.double()
 """
 
 
-def run(code: str, tmp_path: Path) -> str:
-    """What a fresh process prints that finds no compiled kernel."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path)}
+def run(code: str, cache: Path | None = None) -> str:
+    """What a fresh process prints, which finds compiled kernels in a cache or where they are."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    if cache is not None:
+        environment["NUMBA_CACHE_DIR"] = str(cache)
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def test_import_loads_torch_and_numpy_alone(tmp_path):
+def test_import_loads_torch_and_numpy_alone():
     code = f"import hasm_torch, sys; print([m for m in '{HEAVY}'.split() if m in sys.modules])"
-    assert run(code, tmp_path).strip() == "[]"
+    assert run(code).strip() == "[]"
 
 
 def test_first_recall_does_not_wait_and_agrees_with_the_compiled_one(tmp_path):
@@ -62,7 +64,7 @@ print("hasm-kernel" in meanwhile)
     assert run(code, tmp_path).strip() == "True"
 
 
-def test_without_numba_everything_runs_and_says_so_once(tmp_path):
+def test_without_numba_everything_runs_and_says_so_once():
     code = f"""{WITHOUT_NUMBA}{LAYER}{EXPECTED}
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
@@ -70,11 +72,11 @@ with warnings.catch_warnings(record=True) as told:
 torch.testing.assert_close(recalled[-1].double(), expected, atol=1e-5, rtol=1e-5)
 print(len(told), "hasm-torch[fast]" in str(told[0].message))
 """
-    assert run(code, tmp_path).strip() == "1 True"
+    assert run(code).strip() == "1 True"
 
 
 @pytest.mark.parametrize("drive", ["spike", "auto"])
-def test_without_numba_the_model_learns_and_moves_as_with_it(tmp_path, drive):
+def test_without_numba_the_model_learns_and_moves_as_with_it(drive):
     code = f"""
 import numpy as np, torch
 from hasm_torch import HASM, Body, HASMConfig
@@ -91,6 +93,6 @@ for _ in range(10):
     target = model.step(torch.tensor([0.4]), torch.full((1, 3), 3.0))
 print(float(target[0]))
 """
-    with_numba, without = (float(run(x, tmp_path)) for x in (code, WITHOUT_NUMBA + code))
+    with_numba, without = (float(run(x)) for x in (code, WITHOUT_NUMBA + code))
     assert with_numba == pytest.approx(without, abs=1e-5)
     assert with_numba > 0.41

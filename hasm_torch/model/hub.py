@@ -14,8 +14,8 @@ def found(name: str | Path, revision: str | None = None) -> Path:
     """The folder of a checkpoint: a folder that is there, else a repository of the hub.
 
     Args:
-        name: A folder, or "user/name" of a repository, which is taken from the local cache where
-            the hub is not to be reached or ``HF_HUB_OFFLINE`` is set.
+        name: A folder, or as text "user/name" of a repository, which is taken from the local cache
+            where the hub is not to be reached or ``HF_HUB_OFFLINE`` is set.
         revision: Branch, tag or commit of the repository.
 
     Raises:
@@ -23,7 +23,7 @@ def found(name: str | Path, revision: str | None = None) -> Path:
     """
     path = Path(name)
     parts = str(name).split("/")
-    if path.exists() or len(parts) != 2 or not all(parts):
+    if isinstance(name, Path) or path.exists() or len(parts) != 2 or not all(parts):
         return path
     require("robot")
     from huggingface_hub import snapshot_download
@@ -35,7 +35,7 @@ def found(name: str | Path, revision: str | None = None) -> Path:
     except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
         raise FileNotFoundError(
             f"expected a folder written by save_pretrained or a repository of the hub, got {name}: "
-            f"no such folder, and the hub says: {error}"
+            "there is no such folder, and no such repository in the cache or within reach"
         ) from error
 
 
