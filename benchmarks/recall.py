@@ -21,7 +21,7 @@ from torch import Tensor
 
 from benchmarks.machine import print_machine, save_json
 from hasm_torch.apps.command_line import parse_options
-from hasm_torch.memory.recall import Stored, recall_packed, unpack
+from hasm_torch.memory.recall import Stored, recall_packed, unpack, warm_up
 
 VALUES = 8  # joints
 BETA = 1.0
@@ -67,6 +67,7 @@ def main() -> None:
     """Time every size, print tables, write the results and their figure."""
     options = parse_options(Options)
     print_machine()
+    warm_up()
     rounds = 5 if options.quick else 15
     results: list[Result] = []
     with torch.inference_mode():
