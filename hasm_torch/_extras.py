@@ -4,7 +4,14 @@ from importlib.util import find_spec
 
 EXTRAS = {
     "fast": ("numba",),
-    "robot": ("pytorch_kinematics", "safetensors", "draccus", "tqdm", "pyarrow"),
+    "robot": (
+        "pytorch_kinematics",
+        "safetensors",
+        "huggingface_hub",
+        "draccus",
+        "tqdm",
+        "pyarrow",
+    ),
     "sim": ("mujoco", "gymnasium"),
     "viz": ("matplotlib", "PIL", "av", "rerun"),
     "lerobot": ("lerobot",),

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from hasm_torch.data import Episode, SkinPatch, write_episodes
 
@@ -88,3 +89,16 @@ def write(kind: str, root: Path) -> Path:
         robot_type="made",
         observations={PLACE: {"reach": "rad", "one": "1"}} if kind == "bound" else None,
     )
+
+
+def write_all(place: Path) -> dict[str, Path]:
+    """A dataset of every kind."""
+    return {kind: write(kind, place / kind) for kind in KINDS}
+
+
+def assert_same(first: torch.nn.Module, second: torch.nn.Module) -> None:
+    """Two modules hold the same, bit for bit."""
+    mine, theirs = first.state_dict(), second.state_dict()
+    assert mine.keys() == theirs.keys()
+    for name, values in mine.items():
+        assert torch.equal(values, theirs[name]), name

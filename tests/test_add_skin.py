@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import reference
 import torch
+from contacts import contact_force
 
 from hasm_torch.apps.skin import main
 from hasm_torch.robot import Skin
@@ -103,15 +104,6 @@ def neighbours(positions):
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
     return apart.min(1)
-
-
-def contact_force(env):
-    """Sum of the normal forces of all contacts, read from MuJoCo one by one."""
-    wrench, total = np.zeros(6), 0.0
-    for contact in range(env.data.ncon):
-        mujoco.mj_contactForce(env.model, env.data, contact, wrench)
-        total += wrench[0]
-    return total
 
 
 # ---- where cells lie

@@ -15,7 +15,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
-from recordings import KINDS, PLACE, write
+from recordings import KINDS, PLACE, assert_same, write_all
 from safetensors.torch import load_file, save_file
 
 from hasm_torch import HASM
@@ -36,8 +36,7 @@ COLUMNS = {STATE: "state", ACTION: "action", TACTILE: "tactile", PLACE: "observa
 
 @pytest.fixture(scope="module")
 def roots(tmp_path_factory):
-    place = tmp_path_factory.mktemp("made")
-    return {kind: write(kind, place / kind) for kind in KINDS}
+    return write_all(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture(scope="module")
@@ -93,13 +92,6 @@ def checkpoint(trained, root, tmp_path):
     for steps in make_pre_post_processors(trained.config, dataset_stats=stats):
         steps.save_pretrained(tmp_path / "lerobot")
     return tmp_path / "lerobot"
-
-
-def assert_same(first, second):
-    first, second = first.state_dict(), second.state_dict()
-    assert first.keys() == second.keys()
-    for name, values in first.items():
-        assert torch.equal(values, second[name]), name
 
 
 def observations(data, episodes, steps=60):

@@ -9,7 +9,7 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy
-from recordings import FPS, JOINTS, KINDS, PLACE, UNITS, episodes, skin_of, write
+from recordings import FPS, JOINTS, KINDS, PLACE, UNITS, assert_same, episodes, skin_of, write_all
 
 from hasm_torch import HASM, HASMConfig
 from hasm_torch.apps.rerun_recording import dataset_scenes
@@ -74,13 +74,6 @@ def with_actions_in_another_order(root, place):
     return place
 
 
-def assert_same(first, second):
-    first, second = first.state_dict(), second.state_dict()
-    assert first.keys() == second.keys()
-    for name, values in first.items():
-        assert torch.equal(values, second[name]), name
-
-
 def policy_of(root):
     """What ``lerobot-train`` makes of all episodes."""
     meta = LeRobotDatasetMetadata("local/set", root=root)
@@ -92,8 +85,7 @@ def policy_of(root):
 
 @pytest.fixture(scope="module")
 def roots(tmp_path_factory):
-    place = tmp_path_factory.mktemp("kinds")
-    return {kind: write(kind, place / kind) for kind in KINDS}
+    return write_all(tmp_path_factory.mktemp("kinds"))
 
 
 @pytest.fixture(scope="module")

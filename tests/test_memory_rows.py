@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recordings import assert_same
 
 from hasm_torch import HeteroAssociativeMemory
 
@@ -20,11 +21,6 @@ def drawn(rows: int, seed: int, dim: int = 37) -> tuple[torch.Tensor, torch.Tens
 
 def put(memory, codes, values, **options):
     memory.write(codes, torch.ones_like(codes), values, **options)
-
-
-def assert_same(memory, other):
-    for name, tensor in memory.state_dict().items():
-        assert torch.equal(tensor, other.state_dict()[name]), name
 
 
 @settings(max_examples=30, deadline=None)

@@ -1,6 +1,6 @@
-import mujoco
 import numpy as np
 import pytest
+from contacts import contact_force
 from postures import anywhere
 
 from hasm_torch.robot import PATCHES
@@ -13,15 +13,6 @@ def env():
     env = HSRTouchEnv("compliance")
     yield env
     env.close()
-
-
-def contact_force(env):
-    """Sum of the normal forces of all contacts, read from MuJoCo one by one."""
-    wrench, total = np.zeros(6), 0.0
-    for contact in range(env.data.ncon):
-        mujoco.mj_contactForce(env.model, env.data, contact, wrench)
-        total += wrench[0]
-    return total
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.01, 0.3])

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
-from recordings import FPS, JOINTS, KINDS, PLACE, REACHES, episodes, touch, write
+from recordings import FPS, JOINTS, KINDS, PLACE, REACHES, episodes, touch, write_all
 
 from hasm_torch import HASM, HASMConfig
 from hasm_torch.apps.rerun_recording import dataset_scenes
@@ -19,8 +19,7 @@ from hasm_torch.episode import ACTION, STATE
 
 @pytest.fixture(scope="module")
 def roots(tmp_path_factory):
-    place = tmp_path_factory.mktemp("made")
-    return {kind: write(kind, place / kind) for kind in KINDS}
+    return write_all(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture(scope="module")

@@ -192,11 +192,22 @@ def load_all(
                 f"datasets that are learned together must have the same skin: that of {first.root} "
                 f"and {other.root} differ"
             )
-    return first if len(sets) == 1 else replace(first, episodes=_Chained(sets))
+    if len(sets) == 1:
+        return first
+    chained = _Chained(sets)
+    held = all(isinstance(part.episodes, list) for part in sets)
+    return replace(first, episodes=list(chained) if held else chained)
+
+
+class _Read(Sequence[Episode]):
+    """Episodes that are reached by going through those before them."""
+
+    def __getitem__(self, index: Any) -> Any:
+        return next(islice(self, index, None))
 
 
 @dataclass(eq=False)
-class _Chained(Sequence[Episode]):
+class _Chained(_Read):
     """The episodes of several datasets, numbered on."""
 
     sets: list[EpisodeSet]
@@ -204,16 +215,13 @@ class _Chained(Sequence[Episode]):
     def __len__(self) -> int:
         return sum(map(len, self.sets))
 
-    def __getitem__(self, index: Any) -> Any:
-        return next(islice(self, index, None))
-
     def __iter__(self) -> Iterator[Episode]:
         for number, episode in enumerate(chain.from_iterable(self.sets)):
             yield replace(episode, index=number)
 
 
 @dataclass(eq=False)
-class _Stored(Sequence[Episode]):
+class _Stored(_Read):
     """The episodes on disk, of which an episode and a row group of a file are held."""
 
     data: EpisodeSet
@@ -234,9 +242,6 @@ class _Stored(Sequence[Episode]):
     def nbytes(self) -> int:
         """Size of all frames in memory."""
         return self.spans[-1][1] * sum(map(prod, self.shapes.values())) * 8
-
-    def __getitem__(self, index: Any) -> Any:
-        return next(islice(self, index, None))
 
     def __iter__(self) -> Iterator[Episode]:
         from hasm_torch.data import parquet
@@ -279,8 +284,8 @@ class _Stored(Sequence[Episode]):
                     values[key] = held(values[key])
                 check_finite(values[key], key, index)
         action: np.ndarray = values[names.action]
-        if self.data.reordered:
-            action = action[:, self.data.reordered]
+        if order := self.data.reordered:
+            action = action[:, order]
         return Episode(
             index=index,
             # an episode with several tasks names them in the order in which they come up

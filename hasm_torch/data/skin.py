@@ -236,8 +236,11 @@ def same_skin(
     first: Mapping[str, SkinPatch] | None, second: Mapping[str, SkinPatch] | None
 ) -> bool:
     """Whether two datasets describe the same skin."""
-    described = [
-        skin and skin_to_info(skin, max(p.cells.stop for p in patches), patches[0].channels)
-        for skin, patches in ((skin, list((skin or {}).values())) for skin in (first, second))
-    ]
-    return described[0] == described[1]
+    return _described(first) == _described(second)
+
+
+def _described(skin: Mapping[str, SkinPatch] | None) -> dict[str, Any] | None:
+    if not skin:
+        return None
+    patches = list(skin.values())
+    return skin_to_info(skin, max(patch.cells.stop for patch in patches), patches[0].channels)

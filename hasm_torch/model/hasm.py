@@ -102,7 +102,8 @@ class HASM(nn.Module):
             raise ValueError(
                 f"unknown patches {', '.join(unknown)}, valid: {', '.join(self.body.patches)}"
             )
-        warm_up()  # so that neither a control step waits nor its rounding depends on the clock
+        if self.config.storage == "bit":
+            warm_up()  # so that neither a control step waits nor its rounding depends on the clock
         device = self.tolerance.device
         scale = settled.threshold, settled.current_per_newton
         self.skin = skin_encoder(self.config, self.body, *scale).to(device)

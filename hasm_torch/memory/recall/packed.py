@@ -160,10 +160,8 @@ def _straight(query: Tensor, memory: Stored) -> bool:
 
 def _recall(query: Tensor, memory: Stored) -> tuple[Tensor, Tensor, Tensor]:
     """Decision, match, and score, margin and entropy stacked."""
-    if not _compiled(memory):
-        return _by_torch(query, memory)
-    if query.is_cpu and not torch.compiler.is_compiling() and not _compiled_scan.ready():
-        return _by_torch(query, memory)
+    if not (torch.compiler.is_compiling() and _compiled(memory)):
+        return _by_torch(query, memory)  # the operator would do the same
     *arguments, interaction, top_k = memory
     found: tuple[Tensor, Tensor, Tensor] = torch.ops.hasm_torch.packed_recall(
         query.detach(), *arguments, str(interaction), top_k
